@@ -1,7 +1,9 @@
-"""Imports inside mpfjax go one way, only plotting draws, and public names say what they are."""
+"""Imports inside mpfjax go one way, only plotting draws, and injected bugs find their lines."""
 
 import ast
 from pathlib import Path
+
+from tests.bugs import BUGS
 
 PACKAGE = Path(__file__).resolve().parents[1] / "mpfjax"
 # From the ground up: each part may import from those above it here, and from itself.
@@ -57,3 +59,8 @@ def test_imports_go_upward():
                     assert len(there) > 1, f"{path} imports the folder it is in"
                     inner, floors = floor(place[1], FLOORS[place[0]]), FLOORS[place[0]]
                     assert floor(there[1], floors) <= inner, f"{path} imports {module} from below"
+
+
+def test_each_bug_finds_the_line_that_it_replaces():
+    for name, bug in BUGS.items():
+        assert (PACKAGE / bug.file).read_text(encoding="utf-8").count(bug.line) == 1, name

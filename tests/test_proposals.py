@@ -23,7 +23,7 @@ LINEAR = mpfjax.LinearGaussianModel(
     P0=np.eye(3),
 )
 OBSERVATION = jnp.array([1.0, -0.3])
-PREVIOUS = LINEAR.sample_initial(jax.random.key(0), 20)
+PREVIOUS = jnp.asarray(np.random.default_rng(0).normal(size=(20, 3)), jnp.float32)
 
 
 @eqx.filter_jit

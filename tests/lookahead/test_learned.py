@@ -24,7 +24,7 @@ LINE = mpfjax.LinearGaussianModel(
     A=[[1.0, 0.5], [0.0, 0.9]], Q=[[0.1, 0.02], [0.02, 0.1]], H=[[1.0, 0.0]], R=[[0.1]],
     m0=[0.0, 0.3], P0=[[1.0, 0.2], [0.2, 0.5]],
 )  # fmt: skip
-PATH = 1.3 + 0.2 * jnp.sin(jnp.arange(1.0, 9.0))
+PATH = 1.3 + 0.2 * np.sin(np.arange(1.0, 9.0, dtype=np.float32))
 NOISY = PATH + 0.2 * jax.random.normal(jax.random.key(7), (8,))
 SQUARES = PATH**2 + (NOISY - PATH)
 KEYS = jax.random.split(jax.random.key(2), 400)

@@ -32,7 +32,7 @@ def linear_gaussian(mean, noise):
 OBJECTS = [linear_gaussian(m, r) for m, r in ((0.0, 0.5), (3.0, 0.8), (-4.0, 1.5))]
 REPULSION = PairwiseRepulsion(2.0, 4.0)
 MODEL = MultiObjectModel(stack(OBJECTS), NUM_OBJECTS, REPULSION)
-STATES = MODEL.sample_initial(KEY, 5)
+STATES = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3, 2)), jnp.float32)
 OBSERVATION = jnp.array([[0.3], [-1.0], [2.0]])
 OWN = jnp.array([2, 0, 1, 1, 0], jnp.int32)  # an object of each particle
 

@@ -1,6 +1,7 @@
 """`fit` finds the maximum, says what is wrong, and goes on where it was interrupted."""
 
 import warnings
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -213,17 +214,20 @@ def test_python_floats_are_tuned_like_arrays_where_they_are_named():
 WEIGHTS = {"w": lambda filter: filter.moves[1].proposal.network}
 
 
+@cache
+def proposal():
+    return mpfjax.NetworkProposal.create(jax.random.key(0), 1, 1, 0.8)
+
+
 class TestBias:
     """A filter whose resampling has no gradient is tuned with a warning."""
-
-    PROPOSAL = mpfjax.NetworkProposal.create(jax.random.key(0), 1, 1, 0.8)
 
     def warn(self, filter, parameters=NOISE):
         warn_of_bias("fit", pose(filter, len, parameters, None))
 
     @pytest.mark.parametrize("parameters", [NOISE, NOISE | WEIGHTS])
     def test_the_default_is_warned_of_also_beside_a_proposal(self, parameters):
-        filter = mpfjax.particle_filter(ScalarLinear(), 16, proposal=self.PROPOSAL)
+        filter = mpfjax.particle_filter(ScalarLinear(), 16, proposal=proposal())
         with pytest.warns(UserWarning, match='fit: .* score of r is biased.*gradient="stop"'):
             self.warn(filter, parameters)
 
@@ -231,7 +235,7 @@ class TestBias:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             self.warn(mpfjax.particle_filter(ScalarLinear(), 16, gradient="stop"))
-            learning = mpfjax.particle_filter(ScalarLinear(), 16, proposal=self.PROPOSAL)
+            learning = mpfjax.particle_filter(ScalarLinear(), 16, proposal=proposal())
             self.warn(learning, WEIGHTS)
             self.warn(mpfjax.particle_filter(ScalarLinear(), 16, ess_threshold=0.0))
             self.warn(mpfjax.Filter(ScalarLinear(), [mpfjax.Propagate(ScalarLinear())], 16))

@@ -60,8 +60,7 @@ def test_mixed_moments_are_those_of_the_mixture_of_both():
 # --- noises --------------------------------------------------------------------------------
 
 TRACKER = ObjectTracker(M, frames_per_second=25)
-START = TRACKER.init()
-FOLLOW = jax.jit(lambda xs: jax.lax.scan(lambda s, x: advanced(TRACKER, s, x), START, xs))
+FOLLOW = jax.jit(lambda xs: jax.lax.scan(lambda s, x: advanced(TRACKER, s, x), TRACKER.init(), xs))
 
 
 def followed(boxes_of_frames):
