@@ -86,7 +86,7 @@ OTHERWISE = [
     *((chain, "quadratic", 120) for chain in IN_SLOTS),
 ]
 # The parts of all other chains have an exact answer in a file of their own.
-COVERING = ("pf", "pf rqmc", "mpf", "patient merge", "dps", "independent filters")
+COVERING = ("pf", "pf rqmc", "mpf", "dps")
 APPROXIMATE = {"dps prior", "exclusion", "gaussian mixture", "gaussian mixture rqmc"}
 EXACT = [
     *quick_of(

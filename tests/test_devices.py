@@ -175,6 +175,7 @@ class TestIslands:
                 assert (dead[1:] >= dead[:-1]).all()
         assert (dead[:-1] & ~dead[1:]).any()
 
+    @pytest.mark.exactness
     def test_a_constant_moves_the_evidence_and_nothing_else(self):
         """Every island has a scale of its own, beside which none may be rounded away."""
 

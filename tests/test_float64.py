@@ -12,9 +12,10 @@ import pytest
 import mpfjax
 from mpfjax.models.observations import Series
 from mpfjax.running.scan import scan
+from tests.marking import quick_of
 from tests.precision import float64
 from tests.registry import CHAINS, QUICK_CHAINS
-from tests.smoothing.registry import CASES, SMOOTHERS
+from tests.smoothing.registry import SMOOTHERS
 from tests.unbiased import assert_unbiased, ratios_to
 
 KEY = jax.random.key(0)
@@ -53,15 +54,15 @@ def models():
     }
 
 
-@pytest.mark.parametrize(
-    ("name", "chain", "model"),
-    [(name, chain, model) for name in SMOOTHERS for chain, model in (
-        ("mpf", "one dimension"), ("pf", "two modes")
-    ) if (name, chain, model) in CASES],
-)  # fmt: skip
-def test_every_smoother_is_traced(name, chain, model):
+# One of each form by default.
+QUICK = ("backward sampling", "PaRIS", "conditional filter")
+
+
+@pytest.mark.parametrize("model", quick_of(["two modes", "one dimension"], ["two modes"]))
+@pytest.mark.parametrize("name", quick_of(SMOOTHERS, QUICK))
+def test_every_smoother_is_traced(name, model):
     (model, seen), smoother = models()[model], SMOOTHERS[name]
-    filter = CHAINS[chain](model)
+    filter = CHAINS["pf"](model)
 
     def rows(key):
         if smoother.of_run:

@@ -153,7 +153,7 @@ def test_the_references_take_controls_and_matrices_by_time():
 
 def test_evidence_and_means_are_unbiased():
     """E[Ẑ/Z] = 1 and E[Ẑ/Z E^[x_t]] = E[x_t | y_1..y_t], within 4 standard errors."""
-    filter, keys = mpfjax.mixture_particle_filter(Driven(), 48, 3), jax.random.split(KEY, 2000)
+    filter, keys = mpfjax.particle_filter(Driven(), 48), jax.random.split(KEY, 2000)
     run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean, inputs=INPUTS)
     log_z, filtered, _ = truth()
     ratios = ratios_to(log_z, run)

@@ -10,18 +10,16 @@ from tests.switching import MODEL as SWITCHING
 from tests.switching import OBSERVATIONS as SEEN
 
 
-def kept_run(model, observations):
-    filter = mpfjax.mixture_particle_filter(model, 40, 2)
-    return mpfjax.run_filter(jax.random.key(0), filter, observations, collect=None).collected
-
-
 def segments_of(collection):
     return collection.get_segments() if isinstance(collection, LineCollection) else []
 
 
 def test_components_stand_where_their_moments_are():
     """A dot at each living component's mean; bars hold deviations within particles and between."""
-    mixtures = kept_run(SWITCHING, SEEN)
+    by_regime = [mpfjax.GroupBy(lambda state: state.latent)]
+    moves = [mpfjax.PropagateMarginalised(SWITCHING), mpfjax.Resample(), *by_regime]
+    filter = mpfjax.Filter(SWITCHING, moves, 40, 3, initial_moves=by_regime)
+    mixtures = mpfjax.run_filter(jax.random.key(0), filter, SEEN).collected
     axis = draw_components(mixtures, 1, truth=np.zeros(len(SEEN)), least_mass=0.0).axes[0]
     bars = [path[:, 1] for each in axis.collections for path in segments_of(each)]
     last = jax.tree.map(lambda leaf: leaf[-1], mixtures)

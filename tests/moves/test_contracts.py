@@ -25,6 +25,10 @@ QUICK = [
     *((name, 6) for name in ("residual", "multinomial, adaptive", "gaussian")),
     ("residual, fixed number, adaptive", 6),
 ]
+QUICK_REGROUPINGS = (
+    "kmeans reseeded", "merge by deviations", "patient merge", "split", "pool", "random partition",
+    "grouped by a label",
+)  # fmt: skip
 RESAMPLINGS = [(name, m) for name, m in CASES if isinstance(WITHIN_COMPONENTS[name], Resample)]
 
 
@@ -39,7 +43,7 @@ def summaries(mixture):
     return *moments, mixture.component_effective_sample_sizes
 
 
-@pytest.mark.parametrize("name", REGROUPINGS)
+@pytest.mark.parametrize("name", quick_of(REGROUPINGS, QUICK_REGROUPINGS))
 def test_regrouping_changes_nothing_but_indicators_and_memory(name):
     """And leaves a mixture whose summaries are finite."""
     move = REGROUPINGS[name]

@@ -155,9 +155,7 @@ CASES = [
 ]
 # What takes a way of its own; the smoothers of a run share one program.
 QUICK_CASES = [
-    *((smoother, chain, model)
-      for smoother in SMOOTHERS if SMOOTHERS[smoother].of_run
-      for chain, model in (("pf", "four dimensions"), ("mpf", "two modes"))),
+    *((name, "pf", "four dimensions") for name in SMOOTHERS if SMOOTHERS[name].of_run),
     ("PaRIS", "mpf", "two modes"),
     ("conditional filter", "mpf", "one dimension"),
 ]  # fmt: skip

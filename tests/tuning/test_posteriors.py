@@ -82,8 +82,8 @@ def by_gibbs_through_a_mixture():
 @pytest.mark.parametrize(
     "sample",
     [
-        by_metropolis,
-        *exactness([by_gibbs, by_metropolis_steps_within_gibbs, by_gibbs_through_a_mixture]),
+        by_gibbs,  # Metropolis-Hastings and SMC² have theirs in `test_exact_answers.py`
+        *exactness([by_metropolis, by_metropolis_steps_within_gibbs, by_gibbs_through_a_mixture]),
     ],
 )
 def test_chains_have_the_exact_mean_and_variance(sample):

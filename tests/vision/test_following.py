@@ -6,7 +6,6 @@ import pytest
 
 from mpfjax.vision.boxes.following import Snapshot, annotate, follow, track_rows
 from mpfjax.vision.boxes.recipes import PRESETS
-from tests.marking import exactness
 
 
 def snapshots(references=True):
@@ -55,7 +54,8 @@ def test_a_crop_counts_as_slices_do():
     assert (part != 30).any()
 
 
-@pytest.mark.parametrize("name", ["default", *exactness(["paper"])])
+@pytest.mark.exactness
+@pytest.mark.parametrize("name", ["default", "paper"])
 def test_the_recipes_keep_to_objects_that_stand_still(name):
     """A red and a blue box on grey: a component is on each, and in all three frames."""
     still, boxes = (
