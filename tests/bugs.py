@@ -106,8 +106,8 @@ BUGS = {
     ),
     "a checkpoint counts one step too many": Bug(
         "running/long_runs.py",
-        'notes = {"caller": self.caller, "step": state.step}',
-        'notes = {"caller": self.caller, "step": state.step + 1}',
+        'notes = {"step": state.step, "identity": self._described(state.step)}',
+        'notes = {"step": state.step + 1, "identity": self._described(state.step)}',
         "tests/test_storage.py -k LongRuns",
     ),
     "a file is renamed before it is written": Bug(

@@ -39,7 +39,7 @@ from mpfjax.operations.stored import (
     to_int,
     whole_blocks,
 )
-from tests.marking import exactness
+from tests.marking import exactness, quick_of
 from tests.precision import float64
 
 # As one program each, as in a filter: to compile operations one by one takes longer.
@@ -197,7 +197,7 @@ def of_segments(values, labels, num_segments):
     }
 
 
-@pytest.mark.parametrize(("m", "n"), SEGMENTS)
+@pytest.mark.parametrize(("m", "n"), quick_of(SEGMENTS, SEGMENTS[1:6:2]))
 def test_segments(m, n):
     """Some of them empty, some of nothing but -inf; some entries are in none."""
     rng = np.random.default_rng(m)

@@ -7,6 +7,7 @@ import pytest
 from mpfjax.vision import ColourModel, RGBColours
 from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.colour.histograms import integral_histogram, normalise
+from tests.marking import quick_of
 
 HEIGHT, WIDTH, BINS = 600, 620, 4
 COLOURS = RGBColours(BINS)
@@ -70,7 +71,7 @@ def test_a_count_that_cannot_be_made_is_no_zero(frame, pixels, wide_counts):
         np.testing.assert_array_equal(counts, np.round(pixels * numpy_shares(frame, box)))
 
 
-@pytest.mark.parametrize("pixels", SIZES)
+@pytest.mark.parametrize("pixels", quick_of(SIZES, [16_384, 65_536]))
 def test_references_and_their_weights_are_numpys(frame, pixels):
     box = box_of(pixels)
     model = ColourModel.from_frame(frame, box[None], colours=COLOURS, weigh_colours=True)
@@ -85,7 +86,7 @@ def test_references_and_their_weights_are_numpys(frame, pixels):
     np.testing.assert_allclose(model.references[0, 0], expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("pixels", SIZES)
+@pytest.mark.parametrize("pixels", quick_of(SIZES, [16_384, 65_536]))
 def test_the_likelihood_with_contrast_is_numpys(frame, pixels):
     box = box_of(pixels)
     sigma, contrast = 0.15, 0.5
