@@ -12,7 +12,7 @@ from mpfjax.exact import kalman_filter
 from mpfjax.vision import Detections, ObjectTracker
 from mpfjax.vision.tracking.camera import CameraState
 from mpfjax.vision.tracking.gaussian import Gaussian
-from mpfjax.vision.tracking.lives import Doubles, Guesses, Lives, Spans
+from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives, Spans
 from mpfjax.vision.tracking.scores import ScoreState, rising
 from mpfjax.vision.tracking.tracker import advanced
 
@@ -144,7 +144,7 @@ def test_a_shift_of_all_is_the_cameras_and_that_of_one_is_its_own():
     np.testing.assert_allclose(shift, [0.7, 0.0], atol=0.02)
 
 
-# --- scores, guesses, doubles --------------------------------------------------------------
+# --- scores, coasting, duplicates --------------------------------------------------------------
 
 
 def test_rising_is_the_nearest_sequence_that_does_not_fall():
@@ -207,19 +207,19 @@ def test_equal_scores_are_all_strong(score):
 def test_predictions_are_shown_for_as_long_as_they_were_right():
     """At 25 frames a second: a tenth of one before anything is known."""
     spans = Spans.at(jnp.asarray(25.0))
-    guesses = jax.tree.map(jnp.asarray, Guesses.initial())
-    assert int(guesses.longest(spans)) == 2
+    coasting = jax.tree.map(jnp.asarray, Coasting.initial())
+    assert int(coasting.longest(spans)) == 2
     lives = jax.tree.map(jnp.asarray, Lives.initial(3))
     gone = lives._replace(unseen=jnp.array([10, 10, 10]), confirmed=jnp.ones(3, bool))
     now = gone._replace(identities=jnp.array([1, 2, 3], jnp.int32))
-    seen, after = jnp.ones(3, bool), jax.jit(Guesses.after)
+    seen, after = jnp.ones(3, bool), jax.jit(Coasting.after)
     for _ in range(20):
-        right = after(guesses, gone, now, seen, seen, spans)
-        wrong = after(guesses, gone, now, seen, ~seen, spans)
+        right = after(coasting, gone, now, seen, seen, spans)
+        wrong = after(coasting, gone, now, seen, ~seen, spans)
         assert int(right.longest(spans)) >= 5
         assert int(wrong.longest(spans)) == 0
     nobody = gone._replace(identities=jnp.zeros(3, jnp.int32))
-    ended = after(guesses, gone, nobody, ~seen, seen, spans)
+    ended = after(coasting, gone, nobody, ~seen, seen, spans)
     assert float(jnp.sum(ended.wrong)) == 3 * 11
     assert not ended.wrong[9:].any()  # of 20 bins for 25 frames
 
@@ -228,19 +228,19 @@ def test_who_never_leaves_a_neighbour_before_it_ends_is_a_double():
     """Others that began beside an older one decide: most of them ended there, or went away."""
     together = jnp.array([[1.0, 0.4], [0.4, 1.0]])
     apart, seen = jnp.eye(2), jnp.ones(2, bool)
-    after = jax.jit(Doubles.after)
+    after = jax.jit(Duplicates.after)
 
     def many(overlaps_before_the_end, ends):
-        doubles = jax.tree.map(jnp.asarray, Doubles.initial(2))
+        duplicates = jax.tree.map(jnp.asarray, Duplicates.initial(2))
         for name in range(2, 14):
             names = jnp.array([1, name], jnp.int32)
-            doubles = after(doubles, names, jnp.array([name > 2, False]), seen, together)
-            assert np.asarray(doubles.hosts).tolist() == [0, 1]
-            begun = doubles
-            doubles = after(doubles, names, seen, seen, overlaps_before_the_end)
+            duplicates = after(duplicates, names, jnp.array([name > 2, False]), seen, together)
+            assert np.asarray(duplicates.elders).tolist() == [0, 1]
+            begun = duplicates
+            duplicates = after(duplicates, names, seen, seen, overlaps_before_the_end)
             if ends:
                 gone = jnp.array([1, 0], jnp.int32)
-                doubles = after(doubles, gone, jnp.array([True, False]), seen, together)
+                duplicates = after(duplicates, gone, jnp.array([True, False]), seen, together)
         return begun
 
     assert np.asarray(many(together, ends=True).doubtful).tolist() == [False, True]

@@ -1,4 +1,4 @@
-"""The lives of objects: who ends, who begins, who is shown for how long, and who is a double."""
+"""The lives of objects: who ends, who begins, who is shown for how long, and duplicates."""
 
 from typing import NamedTuple
 
@@ -13,9 +13,9 @@ from mpfjax.vision.tracking.scores import KEPT, PRIOR, rising
 _CONFIRMED = 2  # frames with strong detections after which there is an object
 _TENTATIVE = 1  # frames that it may be missed in before
 _BINS = 20  # of the frames that an object may be without a detection
-_SCALE = 0.5  # of the logistic prior of guesses, in longest guesses
+_SCALE = 0.5  # of the logistic prior of coasting, in longest coasts
 _BESIDE = 0.15  # an overlap with an older object from which on one appears beside it
-_LEAST = 1 / 3  # the probability of another object below which one beside it is a double
+_LEAST = 1 / 3  # the probability of another object below which one beside it is a duplicate
 
 
 class Spans(NamedTuple):
@@ -23,12 +23,12 @@ class Spans(NamedTuple):
 
     - `patience`: without a detection, after which an object ends.
     - `lasting`: of a chain of detections, after which it is an object's.
-    - `guess`, `unsure`: without a detection, and without a strong one, in which one is shown.
+    - `coast`, `unsure`: without a detection, and without a strong one, in which one is shown.
     """
 
     patience: Int[Array, ""]
     lasting: Int[Array, ""]
-    guess: Int[Array, ""]
+    coast: Int[Array, ""]
     unsure: Int[Array, ""]
 
     @classmethod
@@ -40,7 +40,7 @@ class Spans(NamedTuple):
 
     @property
     def binned(self) -> Int[Array, ""]:
-        """The frames without a detection of all bins of guesses: a bin has one at least."""
+        """The frames without a detection of all bins: a bin has one at least."""
         return jnp.maximum(self.patience, _BINS)
 
 
@@ -84,7 +84,7 @@ class Lives(NamedTuple):
         strong: Bool[Array, " m"],
         inside: Bool[Array, " m"],
         spans: Spans,
-        guess: Int[Array, ""],
+        coast: Int[Array, ""],
     ) -> "Lives":
         """The lives after a frame's detections, before any birth.
 
@@ -93,7 +93,7 @@ class Lives(NamedTuple):
         confirmed after two frames with strong detections, or at once in the first frame. Where
         there is no room, an unconfirmed one ends in its first frame without a detection, and one
         that was confirmed at once and has had no strong detections since ends as soon as it is no
-        longer shown: after `guess` frames without a detection, or three tenths of a second without
+        longer shown: after `coast` frames without a detection, or three tenths of a second without
         a strong one.
         """
         seen = self.seen + strong.astype(jnp.int32)
@@ -102,9 +102,9 @@ class Lives(NamedTuple):
         confirmed = self.alive & (self.confirmed | (seen >= _CONFIRMED))
         in_the_way = self.full & (seen < _CONFIRMED)
         tentative = jnp.where(self.full, 0, _TENTATIVE)
-        most = jnp.where(confirmed, jnp.where(in_the_way, spans.guess, spans.patience), tentative)
+        most = jnp.where(confirmed, jnp.where(in_the_way, spans.coast, spans.patience), tentative)
         stays = self.alive & inside & (unseen <= most)
-        recent = (unseen <= guess) & (unsure <= spans.unsure)
+        recent = (unseen <= coast) & (unsure <= spans.unsure)
         return self._replace(
             identities=jnp.where(stays, self.identities, 0),
             seen=jnp.where(stays, seen, 0),
@@ -138,15 +138,15 @@ class Lives(NamedTuple):
         )
 
 
-class Guesses(NamedTuple):
+class Coasting(NamedTuple):
     """Predictions in frames without a detection: (20,) that proved `right`, and `wrong`, by age."""
 
     right: Float[Array, " bins"]
     wrong: Float[Array, " bins"]
 
     @classmethod
-    def initial(cls) -> "Guesses":
-        """No guess yet."""
+    def initial(cls) -> "Coasting":
+        """Nobody has coasted yet."""
         return cls(zeros(_BINS), zeros(_BINS))
 
     def after(
@@ -156,8 +156,8 @@ class Guesses(NamedTuple):
         detected: Bool[Array, " m"],
         right: Bool[Array, " m"],
         spans: Spans,
-    ) -> "Guesses":
-        """Count the guesses that this frame decides: all since an object's last detection.
+    ) -> "Coasting":
+        """Count the coasting that this frame decides: all since an object's last detection.
 
         They were right if it is detected again and its prediction is `right`, and wrong if that is
         not so, or if it ends.
@@ -169,19 +169,19 @@ class Guesses(NamedTuple):
         decided = (before.confirmed & which for which in (detected & right, wrong))
         dtype = self.right.dtype
         new = (jnp.sum(jnp.where(which[:, None], counts, 0), 0, dtype) for which in decided)
-        return Guesses(*(KEPT * a + b for a, b in zip(self, new, strict=True)))
+        return Coasting(*(KEPT * a + b for a, b in zip(self, new, strict=True)))
 
     def longest(self, spans: Spans) -> Int[Array, ""]:
         """For how many frames without a detection a prediction is right in half of the cases.
 
-        With r right and w wrong guesses in a bin, and a prior p that is logistic in the number of
+        With r right and w wrong ones in a bin, and a prior p that is logistic in the number of
         frames and 1/2 after a tenth of a second, one is right with probability
 
             (r + n p) / (r + w + n),  n = 5
 
         made non-increasing by isotonic regression.
         """
-        half = spans.guess.astype(jnp.float32) + 0.5
+        half = spans.coast.astype(jnp.float32) + 0.5
         ages = (np.arange(_BINS, dtype=np.float32) + np.float32(0.5)) / _BINS
         frames = ages * spans.binned.astype(jnp.float32) + 0.5
         prior = jax.nn.sigmoid((half - frames) / (_SCALE * half))
@@ -191,23 +191,23 @@ class Guesses(NamedTuple):
         return bins * spans.binned // _BINS
 
 
-class Doubles(NamedTuple):
+class Duplicates(NamedTuple):
     """Whether what appears beside an object is another object, or a second box of the same one.
 
-    - `hosts`: (m,), the identity of the object beside which each appeared, 0 for none and for one
+    - `elders`: (m,), the identity of the object beside which each appeared, 0 for none and for one
       that has been apart from it.
-    - `objects`, `doubles`: how many proved to be objects, and how many to be doubles.
-    - `doubtful`: (m,), which are more probably doubles.
+    - `objects`, `duplicates`: how many proved to be objects, and how many to be duplicates.
+    - `doubtful`: (m,), which are more probably duplicates.
     """
 
-    hosts: Int[Array, " m"]
+    elders: Int[Array, " m"]
     objects: Float[Array, ""]
-    doubles: Float[Array, ""]
+    duplicates: Float[Array, ""]
     doubtful: Bool[Array, " m"]
 
     @classmethod
-    def initial(cls, num_objects: int) -> "Doubles":
-        """Nobody has a host."""
+    def initial(cls, num_objects: int) -> "Duplicates":
+        """Nobody began beside another one."""
         none = zeros(num_objects, dtype=np.int32)
         return cls(none, zeros(), zeros(), none > 0)
 
@@ -217,27 +217,27 @@ class Doubles(NamedTuple):
         stays: Bool[Array, " m"],
         detected: Bool[Array, " m"],
         overlaps: Float[Array, "m m"],
-    ) -> "Doubles":
-        """Count what this frame decides, and give new objects their hosts.
+    ) -> "Duplicates":
+        """Count what this frame decides, and give new objects their elders.
 
-        One proves to be an object once it overlaps its host by less than .15 in a frame in which
-        both are detected. It was a double if it ends before, while its host lives. While another
-        object is less probable than a third, one with a host is doubtful: it has only detections
+        One proves to be an object once it overlaps its elder by less than .15 in a frame in which
+        both are detected. It was a duplicate if it ends before its elder does. While another
+        object is less probable than a third, one with an elder is doubtful: it has only detections
         that the others leave, and is not shown.
         """
-        alive, hosted = identities > 0, self.hosts > 0
-        pairs = (self.hosts[:, None] == identities[None]) & alive[None]
-        host_lives = jnp.any(pairs, axis=1)
+        alive, has_elder = identities > 0, self.elders > 0
+        pairs = (self.elders[:, None] == identities[None]) & alive[None]
+        elder_lives = jnp.any(pairs, axis=1)
         apart = (overlaps < _BESIDE) & detected[:, None] & detected[None]
-        proved = hosted & stays & jnp.any(pairs & apart, axis=1)
+        proved = has_elder & stays & jnp.any(pairs & apart, axis=1)
         older = alive[None] & (identities[None] < identities[:, None])
         beside = jnp.where(older, overlaps, 0.0)
         nearest = identities[jnp.argmax(beside, axis=1)]
         begun = jnp.where(jnp.max(beside, axis=1) > _BESIDE, nearest, 0)
-        kept = jnp.where(host_lives & ~proved, self.hosts, 0)
-        hosts = jnp.where(alive, jnp.where(stays, kept, begun), 0)
-        dtype, ended = self.objects.dtype, hosted & ~stays & host_lives
+        kept = jnp.where(elder_lives & ~proved, self.elders, 0)
+        elders = jnp.where(alive, jnp.where(stays, kept, begun), 0)
+        dtype, ended = self.objects.dtype, has_elder & ~stays & elder_lives
         objects = KEPT * self.objects + jnp.sum(proved, dtype=dtype)
-        doubles = KEPT * self.doubles + jnp.sum(ended, dtype=dtype)
-        probability = (objects + PRIOR / 2) / (objects + doubles + PRIOR)
-        return Doubles(hosts, objects, doubles, (hosts > 0) & (probability < _LEAST))
+        duplicates = KEPT * self.duplicates + jnp.sum(ended, dtype=dtype)
+        probability = (objects + PRIOR / 2) / (objects + duplicates + PRIOR)
+        return Duplicates(elders, objects, duplicates, (elders > 0) & (probability < _LEAST))

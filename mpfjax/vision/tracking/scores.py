@@ -20,7 +20,7 @@ STRONG, WEAK = 0.5, 0.2  # the shares that are strong before anything is learned
 _SLOPE = 0.15  # the prior odds are logistic in the share, of this scale
 PRIOR = 5.0  # detections that the prior of each bin counts as
 KEPT = 0.995  # kept from each frame to the next
-_SAME, _DOUBLE = 0.3, 0.6  # least overlap of boxes in a chain, and of a box with its double
+_SAME, _DUPLICATE = 0.3, 0.6  # least overlap of boxes in a chain, and of a box with its duplicate
 _GONE = 2  # longest gap in a chain, in frames
 
 
@@ -102,8 +102,8 @@ class ScoreState(NamedTuple):
         spread = sure - lowest
         shares = (found.scores - lowest) / jnp.where(spread > 0, spread, 1.0)
         shares = jnp.where(spread > 0, shares, 1.0)
-        doubles = (overlaps > _DOUBLE) & stronger & found.valid[:, None]
-        single = found.valid & ~jnp.any(doubles, axis=0)
+        duplicates = (overlaps > _DUPLICATE) & stronger & found.valid[:, None]
+        single = found.valid & ~jnp.any(duplicates, axis=0)
         state = self._continued(found.boxes, single, stronger, shift, shares, lasting)
         strong = lowest + state.strong_share() * spread
         # Where all scores are equal, rounding must not put them below the threshold.

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.vision.tracking.camera import CameraState
 from mpfjax.vision.tracking.gaussian import Gaussian
-from mpfjax.vision.tracking.lives import Doubles, Guesses, Lives
+from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives
 from mpfjax.vision.tracking.noise import NoiseState
 from mpfjax.vision.tracking.scores import ScoreState
 
@@ -16,16 +16,16 @@ class TrackerState(NamedTuple):
     """All that an `ObjectTracker` remembers, in arrays with a row for each of M objects.
 
     - `objects`: the moments of place and velocity, (m, 4) each.
-    - `lives`, `guesses`, `doubles`: identities and counts; how long predictions are right; who is a
-      second box of another one.
+    - `lives`, `coasting`, `duplicates`: identities and counts; how long predictions are right;
+      which are a second box of another one.
     - `scores`, `camera`, `noise`: what has been learned of the detector, the camera and the motion.
     - `colours`: (m, bins), the histograms of each object, all zero where it has none.
     """
 
     objects: Gaussian
     lives: Lives
-    guesses: Guesses
-    doubles: Doubles
+    coasting: Coasting
+    duplicates: Duplicates
     scores: ScoreState
     camera: CameraState
     noise: NoiseState
@@ -41,7 +41,7 @@ class Tracks(NamedTuple):
     - `unseen`: (m,), frames since its last detection.
     - `full`: whether a detection that would have started an object found no room.
     - `shown`: (m,), which are confirmed, were detected a moment ago, and are not more probably
-      doubles of another one.
+      duplicates of another one.
     - `detections`: (m,), the row of the detection assigned to each in this frame, in what the
       detector gave; -1 for none. Use it to look up masks and features.
     - `probabilities`: (m,), that this detection is the object's own; 0 where there is none.

@@ -34,7 +34,7 @@ from mpfjax.vision.tracking.gaussian import (
     within,
     zeros,
 )
-from mpfjax.vision.tracking.lives import Doubles, Guesses, Lives, Spans
+from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives, Spans
 from mpfjax.vision.tracking.noise import NoiseState
 from mpfjax.vision.tracking.scores import STRONG, WEAK, ScoreState
 from mpfjax.vision.tracking.state import TrackerState, Tracks
@@ -80,7 +80,7 @@ class ObjectTracker(Checked):
       scale. "as_given" takes scores for probabilities: strong from .5 on, and below .2 a detection
       counts for nothing. "ignore" takes all for strong.
     - `class_matters`: with True objects have detections of their own class only, and those of
-      another one are no doubles. "prefers" is for detectors that mix up classes: another class
+      another one are no duplicates. "prefers" is for detectors that mix up classes: another class
       costs as much as a weak score does. False does not look at classes. Class 0 is none, and goes
       with all.
 
@@ -103,8 +103,8 @@ class ObjectTracker(Checked):
         state = TrackerState(
             objects=Gaussian.nowhere(m),
             lives=Lives.initial(m),
-            guesses=Guesses.initial(),
-            doubles=Doubles.initial(m),
+            coasting=Coasting.initial(),
+            duplicates=Duplicates.initial(m),
             scores=ScoreState.initial(m),
             camera=CameraState.initial(),
             noise=NoiseState.initial(m, float(self.frames_per_second)),
@@ -237,10 +237,10 @@ def advanced(
     objects = updated.mixed_with(predicted, probability[:, None])
 
     inside = within(boxes_of(objects.place), found.extent, centred=~taken.there)
-    guess = state.guesses.longest(spans)
-    lives = state.lives.counted(taken.there, taken.strong, inside, spans, guess)
+    coast = state.coasting.longest(spans)
+    lives = state.lives.counted(taken.there, taken.strong, inside, spans, coast)
     right = shared(boxes_of(predicted.place), found.detections.boxes[taken.rows]) >= _SAME
-    guesses = state.guesses.after(state.lives, lives, taken.there, right, spans)
+    coasting = state.coasting.after(state.lives, lives, taken.there, right, spans)
 
     stays, wanted = lives.alive, _unexplained(tracker, state, lives, objects, found, source, strong)
     begun = seated(wanted, found.stronger, ~stays)
@@ -253,8 +253,8 @@ def advanced(
     boxes = boxes_of(objects.place)
     alike = _may_be_one(tracker, lives.classes, lives.classes)
     overlaps = jnp.where(alike, overlap(boxes, boxes), 0.0)
-    doubles = state.doubles.after(lives.identities, stays, taken.there, overlaps)
-    lives = lives._replace(shown=lives.shown & ~doubles.doubtful)
+    duplicates = state.duplicates.after(lives.identities, stays, taken.there, overlaps)
+    lives = lives._replace(shown=lives.shown & ~duplicates.doubtful)
     teaches, there = taken.strong & stays, taken.there & stays
     known, grown = teaches & lives.confirmed & (lives.seen >= _FIRST), lives.seen == _FIRST
     noise = noise.after(taken.place, there, known, born, teaches & grown, objects)
@@ -264,7 +264,7 @@ def advanced(
         alone = ~jnp.any((overlaps > _CONTACT) & others, axis=1)
         kept = jnp.where(born[:, None], 0.0, colours)
         colours = learned_colours(kept, taken.values(found.colours, 0.0), alone)
-    state = TrackerState(objects, lives, guesses, doubles, scores, camera, noise, colours)
+    state = TrackerState(objects, lives, coasting, duplicates, scores, camera, noise, colours)
     rows = detections.rows_of(jnp.where(taken.there, taken.rows, -1))
     probability = jnp.where(born, 1.0, jnp.where(stays, probability, 0.0))
     told = lives.identities, lives.confirmed, lives.unseen, lives.full, lives.shown
@@ -327,7 +327,7 @@ def _associated(
     cost += jnp.where(strong, 0.0, _WEAK_COST)[None]
     cost += jnp.where(state.lives.confirmed, 0.0, _DOUBT_COST)[:, None]
     possible = state.lives.alive[:, None] & counts[None] & (cost < 0)
-    cost = jnp.where(state.doubles.doubtful[:, None], _YIELDING * cost, cost)
+    cost = jnp.where(state.duplicates.doubtful[:, None], _YIELDING * cost, cost)
     cost = jnp.where(possible, cost, jnp.inf)
     source = one_to_one(cost)
     chosen = jnp.maximum(source, 0)[:, None]
@@ -351,5 +351,5 @@ def _unexplained(
     past = jnp.where(source >= 0, source, len(strong))  # a scatter drops it
     free = jnp.ones_like(strong).at[past].set(False, mode="drop")
     wanted = strong & free & within(boxes, found.extent) & ~jnp.any(covered, axis=0)
-    doubles = (found.overlaps > _BIRTH_OVERLAP) & wanted[:, None] & found.stronger
-    return wanted & ~jnp.any(doubles, axis=0)
+    duplicates = (found.overlaps > _BIRTH_OVERLAP) & wanted[:, None] & found.stronger
+    return wanted & ~jnp.any(duplicates, axis=0)
