@@ -184,17 +184,6 @@ def test_an_interrupt_ends_the_commands_own_process_at_once():
     assert ended.stderr.count("interrupted") == 2
 
 
-def test_frames_that_cannot_be_read_on_leave_what_was_done(sequence, given, tmp_path, capsys):
-    (tmp_path / "img").mkdir()
-    for path in (sequence / "img").iterdir():
-        length = 2000 if "5" in path.name else None
-        (tmp_path / "img" / path.name).write_bytes(path.read_bytes()[:length])
-    assert run(tmp_path, *given[1:], "--out", tmp_path / "out") == 2
-    assert "000005.png" in capsys.readouterr().err
-    assert summary_in(tmp_path / "out")["frames"] == 4
-    assert read_tracks(tmp_path / "out" / "tracks.txt")[-1, 0] == 4
-
-
 def test_what_moves_is_detected(sequence, tmp_path):
     pytest.importorskip("cv2", reason="detecting needs the extra 'video', which 'test' brings")
     assert run(sequence, "--detect", "--out", tmp_path, *SMALL, "--no-video") == 0

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.mixture import flatten_states, single_component
+from mpfjax.mixture import flatten_states
 from mpfjax.moves.regrouping.features import ByFeatures
 from tests.examples import example_mixtures, log_masses
 
@@ -46,15 +46,6 @@ def test_what_is_derived_is_what_numpy_gives(mixture):
         np.testing.assert_allclose(means[m], mean, rtol=1e-4, atol=1e-5)
         covariance = (w[:, None] * centred).T @ centred
         np.testing.assert_allclose(covariances[m], covariance, rtol=1e-3, atol=1e-4)
-
-
-def test_a_single_component_has_equal_weights_and_is_its_own_ancestor():
-    mixture = single_component({"x": jnp.arange(6.0)}, 3)
-    np.testing.assert_allclose(mixture.weights, 1 / 6, rtol=1e-6)
-    np.testing.assert_array_equal(mixture.component_counts, [6, 0, 0])
-    np.testing.assert_array_equal(mixture.ancestor_indices, np.arange(6))
-    assert float(mixture.mean()["x"]) == pytest.approx(2.5)
-    assert mixture.num_particles == 6
 
 
 def test_flattening_puts_all_leaves_side_by_side():

@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-import mpfjax
-from benchmarks import harness
 from benchmarks.coverage import coverage, covers
-from benchmarks.interacting_objects.partitions import adaptive_partitions
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel, soft_histograms
 from benchmarks.masses.scenes import SCENES
 from benchmarks.partitioned_sampling.posterior import distance_maps
@@ -18,7 +15,6 @@ from benchmarks.smoothing.jobs import Linear, Quadratic
 from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.colour.bins import RGBColours
 from mpfjax.vision.colour.histograms import integral_histogram
-from tests.examples import stack, walker
 from tests.marking import exactness
 from tests.precision import float64
 from tests.smoothing.exact_smoothers import gaussian_smoother, grid_smoother
@@ -79,23 +75,6 @@ def test_maps_are_counted_pixel_by_pixel():
             expected += 1 - np.sqrt(shares * references[0, part]).sum()
         place = found[top + sides[1], left + sides[0]]
         assert place == pytest.approx(expected, abs=1e-5)
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize("num_draws", [None, 1])
-def test_objects_that_never_meet_are_proposed_exactly(num_draws):
-    """Beside the exact evidence of two walkers."""
-    path = jnp.array([[0.2, 1.6], [0.9, 1.4], [1.2, 1.2]])[:, :, None]
-    model = mpfjax.MultiObjectModel(stack([walker(0.0), walker(2.0)]), 2)
-    keys = jax.random.split(jax.random.key(0), 400)
-    filter = adaptive_partitions(model, 50, num_draws)
-    runs = mpfjax.monte_carlo(keys, filter, path, harness.nothing)
-    exact = sum(
-        mpfjax.exact.kalman_filter(walker(start), path[:, k]).log_marginal_likelihood
-        for k, start in enumerate((0.0, 2.0))
-    )
-    ratios = np.exp(np.asarray(runs.log_marginal_likelihood) - float(exact))
-    assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(len(ratios)) < 0.1
 
 
 # --- colours and boxes --------------------------------------------------------------------------

@@ -143,8 +143,3 @@ def test_it_goes_on_from_a_checkpoint_of_the_same_objective(tmp_path, wrap):
     )
     with pytest.raises(ValueError, match=r"is of another maximise: objective.* is"):
         part(7, 4.0)
-
-
-def test_a_break_is_said_to_be_its_own():
-    with pytest.raises(RuntimeError, match="maximise: the value was nan at the start"):
-        ascent(lambda key, model: model.lambda_ * jnp.nan)

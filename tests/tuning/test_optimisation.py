@@ -186,11 +186,6 @@ def falling(step):
     return optax.stateless(lambda updates, _: jax.tree.map(lambda u: 0 * u - step, updates))
 
 
-def test_the_bar_shows_the_steps(capsys):
-    short_fit(2, progress=True)
-    assert "2/2" in capsys.readouterr().err
-
-
 class Plain(ScalarLinear):
     """Fields as a user writes them who knows nothing of arrays: floats, a count, a constant."""
 

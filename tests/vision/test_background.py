@@ -1,7 +1,5 @@
 """Detection against what was drawn, and on real video against boxes drawn by hand."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -163,12 +161,6 @@ def test_what_has_not_the_size_or_shape_of_a_person_is_dropped():
     assert len(detections(frames, **PEOPLE)[-1]) == 0
     lenient = detections(frames, area=(0.0, 1.0), cut_aspect=0)[-1]
     np.testing.assert_allclose(lenient, [(10, 10, 2, 3), (20, 100, 70, 4), (100, 20, 4, 70)])
-
-
-def test_a_missing_opencv_says_how_to_install_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(ImportError, match="pip install opencv-python-headless"):
-        BackgroundSubtraction()
 
 
 @pytest.mark.real_data

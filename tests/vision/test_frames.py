@@ -1,7 +1,6 @@
 """Folders of images, videos and GIFs in and out."""
 
 import struct
-import sys
 from fractions import Fraction
 
 import numpy as np
@@ -139,10 +138,3 @@ def test_whatever_an_image_holds_it_becomes_three_channels_of_eight_bits(tmp_pat
     assert frame.dtype == np.uint8
     assert frame.shape == (32, 48, 3)
     np.testing.assert_array_equal(frame, np.repeat(grey[:, :, None], 3, axis=2))
-
-
-def test_a_missing_pyav_says_how_to_install_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "av", None)
-    (tmp_path / "video.mp4").write_bytes(b"a video")
-    with pytest.raises(ImportError, match="pip install av"):
-        next(read_frames(tmp_path / "video.mp4"))

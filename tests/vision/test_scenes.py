@@ -33,14 +33,3 @@ def test_the_distracter_stands_over_object_one_which_walks_away(scenes):
         # Corners are rounded to whole pixels.
         assert 3 <= gaps(scene)[7] <= 13
         assert gaps(scene)[-1] >= 11
-
-
-def test_steps_are_those_of_the_papers_dynamics(scenes):
-    """x_t - x_{t-1} - 0.5 (x_{t-1} - x_{t-2}) has a deviation of 3; boxes are on whole pixels."""
-    paths = np.stack([scene.boxes[:, 1:, :2] for scene in scenes])
-    steps = np.diff(paths, axis=1)
-    noise = steps[:, 1:] - 0.5 * steps[:, :-1]
-    rounding = (1 + 1.5**2 + 0.5**2) / 12
-    np.testing.assert_allclose(noise.std(), np.sqrt(9 + rounding), rtol=0.04)
-    correlation = np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1]
-    assert abs(correlation) < 0.2
