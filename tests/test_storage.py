@@ -14,7 +14,7 @@ import pytest
 import mpfjax
 from mpfjax.operations.random import fast_key
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
-from mpfjax.running.storage import load_arrays, write_arrays
+from mpfjax.running.storage import read_described, write_described
 from tests.examples import make_mixture
 from tests.full_disk import no_room_beyond
 
@@ -115,9 +115,9 @@ class TestRoundTrip:
 
 class TestFiles:
     def test_a_file_that_is_cut_off_or_has_a_flipped_bit_loads_as_it_was_or_not_at_all(self, path):
-        write_arrays(path, {"x": np.arange(3.0)})
+        write_described(path, {"x": np.arange(3.0)}, {})
         stored = path.read_bytes()
-        np.savez_compressed(path, x=np.arange(3.0))
+        np.savez_compressed(path, x=np.arange(3.0), description="{}")
         faults = []
         for whole in (stored, path.read_bytes()):
             spoilt = [whole[:length] for length in range(0, len(whole), 7)]
@@ -128,7 +128,7 @@ class TestFiles:
             for content in spoilt:
                 path.write_bytes(content)
                 try:
-                    np.testing.assert_equal(load_arrays(path), {"x": np.arange(3.0)})
+                    np.testing.assert_equal(read_described(path), ({"x": np.arange(3.0)}, {}))
                 except ValueError as error:
                     faults.append(str(error))
         assert len(faults) > 100
@@ -167,11 +167,11 @@ class TestFiles:
 
         for array in (np.array([Code()], object), np.asarray(jnp.ones(2, jnp.bfloat16))):
             with pytest.raises(ValueError, match=r"mine: .* does not load without pickles"):
-                write_arrays(path, {"mine": array})
+                write_described(path, {"mine": array}, {})
         assert not path.parent.exists()
         np.savez(tmp_path / "code.npz", x=np.array([Code()], object))
         with pytest.raises(ValueError, match=r"code.npz"):
-            load_arrays(tmp_path / "code.npz")
+            read_described(tmp_path / "code.npz")
         assert not trace.exists()
 
     @pytest.mark.parametrize(
@@ -190,8 +190,8 @@ class TestFiles:
         state = {"x": jnp.arange(3.0), "key": jax.random.key(0), "t": 2}
         state |= {"half": jnp.ones(2, "bfloat16")}
         mpfjax.save_checkpoint(path, state)
-        arrays = {**load_arrays(path), name: array}
-        write_arrays(path, {name: array for name, array in arrays.items() if array is not None})
+        arrays = {**np.load(path), name: array}
+        np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
         with pytest.raises(ValueError, match=r"checkpoint.npz: ") as info:
             mpfjax.load_checkpoint(path, like=state)
         assert name in str(info.value) or "descri" in str(info.value)

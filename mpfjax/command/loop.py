@@ -125,7 +125,7 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
     def tracks(stills: Iterable[np.ndarray] | None) -> Generator[Tracks, None, None]:
         return track(
             stills,
-            rows if detector is None else _timed(detector.detect, results.ahead),
+            rows if detector is None else results.ahead.of("detect")(detector.detect),
             tracker,
             key=key,
             first=source.first,
@@ -137,14 +137,6 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
         )
 
     return tracks
-
-
-def _timed(detect: Callable[[Any], Any], clock: Clock) -> Callable[[Any], Any]:
-    def timed(frame: Any) -> Any:
-        with clock.of("detect"):
-            return detect(frame)
-
-    return timed
 
 
 def _track(results: Results, start: Start) -> None:

@@ -260,41 +260,32 @@ def _remove_what_the_killed_left(path: Path) -> None:
                 other.unlink()
 
 
-def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays by name as .npz, whole or not at all; `np.load` reads it without pickles.
+def write_described(
+    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]
+) -> None:
+    """Write arrays by name as .npz, and a description that JSON can hold; whole or not at all.
 
-    Raises `ValueError` for an array that could not be read so, and `OSError` as `write_whole`.
+    `np.load` reads it without pickles. Raises `ValueError` for an array that could not be read so,
+    and `OSError` as `write_whole`.
     """
     for name, array in arrays.items():
         if array.dtype.hasobject or array.dtype.kind == "V":
             raise ValueError(f"{name}: an array of {array.dtype} does not load without pickles")
-    write_whole(path, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]
-
-
-def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file; `ValueError` for one that is cut off, damaged or none."""
-    with open(path, "rb") as file:
-        try:
-            found = np.load(file, allow_pickle=False)
-            # What is no array comes as bytes, which have no view.
-            return {name: found[name].view() for name in found.files}
-        except Exception as error:  # a flipped bit may lead to any
-            raise ValueError(f"{path}: cut off, damaged or no .npz file ({error})") from error
-
-
-def write_described(
-    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]
-) -> None:
-    """Write arrays by `write_arrays`, and beside them a description that JSON can hold."""
-    write_arrays(path, {**arrays, _DESCRIPTION: np.array(json.dumps(description))})
+    content: Any = {**arrays, _DESCRIPTION: np.array(json.dumps(description))}
+    write_whole(path, lambda file: np.savez(file, **content))
 
 
 def read_described(
     path: str | os.PathLike[str],
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the description that `write_described` wrote; `ValueError` for other files."""
-    arrays = load_arrays(path)
-    try:
-        return arrays, dict(json.loads(str(arrays.pop(_DESCRIPTION))))
-    except (KeyError, ValueError, TypeError) as error:
-        raise ValueError(f"{path}: it does not describe what it holds ({error})") from error
+    with open(path, "rb") as file:
+        try:
+            found = np.load(file, allow_pickle=False)
+            # What is no array comes as bytes, which have no view.
+            arrays = {name: found[name].view() for name in found.files}
+            return arrays, dict(json.loads(str(arrays.pop(_DESCRIPTION))))
+        except Exception as error:  # a flipped bit may lead to any
+            raise ValueError(
+                f"{path}: cut off, damaged or without description ({error})"
+            ) from error
