@@ -11,11 +11,7 @@ import pytest
 import scipy.stats
 from scipy.stats import qmc
 
-from mpfjax.models.noise import (
-    draw_family_noise,
-    draw_noise,
-    stratified_uniform,
-)
+from mpfjax.models.noise import draw_family_noise, draw_noise, stratified_uniform
 from mpfjax.moves.resampling.sorting import (
     bits_per_dimension,
     hilbert_index,

@@ -50,8 +50,7 @@ def one_frame(metric, **settings):
 
 def stone_soup(estimates, truths, **settings):
     reference = pytest.importorskip(
-        "stonesoup.metricgenerator.ospametric",
-        reason="stonesoup, the reference, is not installed",
+        "stonesoup.metricgenerator.ospametric", reason="stonesoup, the reference, is not installed"
     )
     from stonesoup.types.state import State
 

@@ -10,11 +10,7 @@ import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion
 from tests.examples import stack, walker
 from tests.marking import exactness
-from tests.moves.test_partitioned import (
-    NOISES,
-    assert_both_unbiased,
-    pair_on_a_grid,
-)
+from tests.moves.test_partitioned import NOISES, assert_both_unbiased, pair_on_a_grid
 
 KEY = jax.random.key(0)
 MEANS, STRENGTH, RADIUS = (-0.5, 4.0), 3.0, 0.8

@@ -63,8 +63,7 @@ def test_a_singular_covariance_draws_within_its_plane_and_where_leaves_the_rest_
 
 
 @pytest.mark.parametrize(
-    ("max_components", "importance"),
-    [(1, "propagated"), *exactness([(3, "predictive_gaussian")])],
+    ("max_components", "importance"), [(1, "propagated"), *exactness([(3, "predictive_gaussian")])]
 )
 def test_moments_are_the_kalman_filters(max_components, importance):
     """On a linear-Gaussian model one component is exact, and any number close to it."""

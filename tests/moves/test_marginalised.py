@@ -15,15 +15,7 @@ from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.moves.propagation.regimes import children
 from tests.marking import quick_of
 from tests.precision import float64
-from tests.switching import (
-    MODEL,
-    NUM_REGIMES,
-    OBSERVATIONS,
-    TRANSITIONS,
-    moments,
-    regimes,
-    truth,
-)
+from tests.switching import MODEL, NUM_REGIMES, OBSERVATIONS, TRANSITIONS, moments, regimes, truth
 from tests.unbiased import assert_unbiased
 
 NUM_RUNS, NUM_PARTICLES = 1000, 30

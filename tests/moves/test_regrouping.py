@@ -192,14 +192,6 @@ class TestSplit:
         np.testing.assert_array_equal(by_sample, by_all)
         assert len(np.unique(by_all)) == 4
 
-    def test_a_sample_is_spread_over_all_usable_slots(self):
-        """Of 100 slots where 2 * 32 are enough, every second is taken, not the first 64."""
-        states = np.concatenate([np.zeros(66), np.full(34, 9.0), np.zeros(900)])
-        log_weights = np.where(np.arange(1000) < 100, 0.0, -np.inf)
-        mixture = make_mixture(states[:, None], log_weights, np.zeros(1000), 2)
-        mixture = mixture.replace(usable_slots=jnp.asarray(100))
-        np.testing.assert_array_equal(labels_after(Split(), mixture)[:100], states[:100] == 9)
-
 
 class TestPoolAndRandomPartition:
     MIXTURE = clouds([[0, 0], [5, 5]], [10, 13])

@@ -13,12 +13,7 @@ import numpy as np
 
 import mpfjax
 from mpfjax import Series
-from mpfjax.smoothing import (
-    conditional_filter,
-    sample_trajectories,
-    smoothed_sums,
-    trace_ancestors,
-)
+from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_sums, trace_ancestors
 from tests.registry import CHAINS
 
 NUM_TRAJECTORIES, LAG = 4, 2

@@ -124,11 +124,7 @@ def test_means_covariances_and_pairs_are_the_exact_ones(name, chain, model):
 
 
 # Nothing seen, a step of zero likelihood between others, and one step alone.
-ODD = {
-    "nothing seen": [np.nan] * 3,
-    "zero likelihood": [1.0, 1e30, np.nan],
-    "one step": [1.0],
-}
+ODD = {"nothing seen": [np.nan] * 3, "zero likelihood": [1.0, 1e30, np.nan], "one step": [1.0]}
 ONLINE = [name for name, smoother in SMOOTHERS.items() if smoother.online]
 
 

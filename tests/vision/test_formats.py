@@ -84,12 +84,7 @@ def test_the_eighth_column_is_read_for_what_the_files_say_that_it_is(tmp_path, n
     assert {places.get(row[2], -1): row[1] for row in truth.ignored} == ignored
 
 
-FORMATS = {
-    "motchallenge": [1, 4],
-    "cvat": [1, 2, 4],
-    "visdrone": [1, 2, 4],
-    "uavdt": [1, 2, 3, 4],
-}
+FORMATS = {"motchallenge": [1, 4], "cvat": [1, 2, 4], "visdrone": [1, 2, 4], "uavdt": [1, 2, 3, 4]}
 
 
 @pytest.mark.parametrize(("format", "counted"), FORMATS.items(), ids=FORMATS)
