@@ -2,13 +2,14 @@
 
 import argparse
 import importlib
+import os
 import re
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from mpfjax.command.scoring import find_truth
 from mpfjax.console import finite, positive, refuse_overwriting, seed, whole
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import frames
@@ -18,6 +19,7 @@ from mpfjax.vision.files.sequences import (
     detection_files,
     last_frame,
     read_sequence_info,
+    read_truth,
     sequence_of,
 )
 
@@ -36,8 +38,9 @@ examples:
 
 SOURCE = "a video, a folder of images, or detections: a file of them, or a folder with det.txt"
 TRACKS, VIDEO, SUMMARY = OUTPUTS = ("tracks.txt", "tracking.mp4", "summary.json")
-
-
+SCORES = ("HOTA", "MOTA", "IDF1")
+NO_SCORES = "no HOTA, MOTA and IDF1"
+_INNER = ("img", "img1")
 _TEXT = (".txt", ".csv")
 _NOT_WITH = {
     "box": ("max_objects", "min_score", "no_colour", "camera_motion", "offline"),
@@ -175,6 +178,29 @@ def open_source(options: argparse.Namespace) -> Source:
         rows = rows[rows[:, 0] <= last]
     rate = options.fps or (frames.frame_rate(path) if has_pixels else info.frame_rate)
     return Source(path, has_pixels, rows, first, last, num_frames, rate, info.size, truth)
+
+
+def find_truth(source: Path, given: Path | None, first: int, last: int | None) -> Truth | None:
+    """The truth that was given, or that of a folder of images, in these frames; None without one.
+
+    A video has no folder, and so no truth unless it is given. Warns of a truth beside the images
+    that cannot be read; raises `ValueError` for a given one.
+    """
+    if given is None and not source.is_dir():
+        return None
+    folder = Path(os.path.abspath(source))
+    try:
+        truth = read_truth(given or (folder.parent if folder.name in _INNER else folder))
+    except (ValueError, OSError) as error:
+        if given is not None:
+            raise
+        if not isinstance(error, FileNotFoundError):
+            warnings.warn(f"{NO_SCORES}: {error}", RuntimeWarning, stacklevel=2)
+        return None
+    truth = truth.between(first, last or np.inf)
+    if given is not None and not len(truth.objects):
+        raise ValueError(f"--truth: {given} has no box in these frames")
+    return truth if len(truth.objects) else None
 
 
 def _has_pixels(path: Path) -> bool:

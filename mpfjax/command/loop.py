@@ -3,6 +3,7 @@
 import argparse
 import collections
 import contextlib
+import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ import numpy as np
 from tqdm import tqdm
 
 from mpfjax.command.arguments import (
+    NO_SCORES,
+    SCORES,
     SUMMARY,
     TRACKS,
     VIDEO,
@@ -19,11 +22,13 @@ from mpfjax.command.arguments import (
     open_source,
     read_boxes,
 )
-from mpfjax.command.scoring import SCORES, scores_of
 from mpfjax.console import Clock, format_table, peak_memory, write_json
+from mpfjax.metrics import multi_object_scores
+from mpfjax.metrics.tracking_scores import matches
 from mpfjax.vision.boxes.following import follow_boxes
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
+from mpfjax.vision.files.sequences import Truth
 from mpfjax.vision.files.threads import read_ahead, write_behind
 from mpfjax.vision.tracking.adapters import LEAST_ROOM, Rows
 from mpfjax.vision.tracking.background import BackgroundSubtraction
@@ -82,6 +87,42 @@ class Results:
         }
         first = self.source.first
         return summary | scores_of(rows, self.source.truth, first, first + n - 1, self.drawn)
+
+
+def scores_of(
+    rows: np.ndarray, truth: Truth | None, first: int, last: int, drawn: np.ndarray | None
+) -> dict[str, float]:
+    """HOTA, MOTA and IDF1 of rows in these frames, where there is a truth.
+
+    Where boxes were drawn, only the objects in these boxes are scored.
+    """
+    if truth is None or not np.any(truth.objects[:, 0] <= last):
+        return {}
+    if drawn is not None:
+        start = truth.objects[truth.objects[:, 0] == first]
+        boxes, objects = matches(drawn, start[:, 2:])
+        if len(boxes) < len(drawn):
+            print(
+                f"scored: {len(boxes)} of {len(drawn)} boxes, those around an object of the truth",
+                file=sys.stderr,
+            )
+        if not len(boxes):
+            return {}
+        rows = rows[np.isin(rows[:, 1], boxes + 1)]
+        wanted = np.isin(truth.objects[:, 1], start[objects, 1])
+        truth = truth._replace(objects=truth.objects[wanted])
+    try:
+        scores = multi_object_scores(
+            rows,
+            truth.objects,
+            (first, last),
+            ignored=truth.ignored,
+            min_height=truth.min_height,
+        )
+    except (ImportError, ValueError) as error:
+        print(f"{NO_SCORES}: {error}", file=sys.stderr)
+        return {}
+    return {name: round(scores[name], 4) for name in SCORES}
 
 
 def run(options: argparse.Namespace) -> None:
