@@ -140,7 +140,7 @@ def _has_numbers(array: Any) -> bool:
     dtype: Any = getattr(array, "dtype", None)
     is_numeric = dtype is not None and any(jnp.issubdtype(dtype, k) for k in (np.number, np.bool_))
     # Durations are whole numbers for numpy. No type of JAX holds long doubles.
-    return is_numeric and dtype.char not in "mgG"
+    return is_numeric and array.dtype.char not in "mgG"
 
 
 def kinds(tree: Any) -> str:
@@ -163,38 +163,26 @@ def check_one_each(number: int, of_what: str = "particles", /, **trees: Any) -> 
 class Rule:
     """What an argument must be, beside its type: `Annotated[float, Rule(isfinite, "finite")]`.
 
-    `check`: takes the argument's value and its name, and raises a `ValueError`.
+    `holds` says of a value whether it is `what` says in words.
     """
 
-    check: Callable[[Any, str], None]
+    holds: Callable[[Any], Any]
     what: str
 
     def __repr__(self) -> str:
         return self.what
 
-    def holds(self, value: Any) -> bool:
-        """Whether the value is what it must be."""
-        with contextlib.suppress(ValueError):
-            self.check(value, "")
-            return True
-        return False
-
-
-def of(holds: Callable[[Any], Any], what: str) -> Rule:
-    """The rule for a value of which this holds; `what` says so in words."""
-
-    def check(value: Any, name: str) -> None:
-        if not holds(value):
+    def check(self, value: Any, name: str) -> None:
+        """Raise a `ValueError` for another value, by the argument's name."""
+        if not self.holds(value):
             hint = f"; write {value.__name__}(...)" if isinstance(value, type) else ""
-            raise ValueError(f"{name}: {shown(value)} is not {what}{hint}")
-
-    return Rule(check, what)
+            raise ValueError(f"{name}: {shown(value)} is not {self.what}{hint}")
 
 
 def number(holds: Callable[[Any], Any], what: str) -> Rule:
     """The rule for a number of which this holds."""
     kinds = int | float | np.integer | np.floating
-    return of(
+    return Rule(
         lambda value: isinstance(value, kinds) and not isinstance(value, bool) and holds(value),
         what,
     )
@@ -216,7 +204,7 @@ def share(most: float = 1.0) -> Rule:
 def one_of(choices: Iterable[str]) -> Rule:
     """The rule for one of some strings, where they are not written out as a `Literal`."""
     names = sorted(choices)
-    return of(lambda value: isinstance(value, str) and value in names, f"one of {names}")
+    return Rule(lambda value: isinstance(value, str) and value in names, f"one of {names}")
 
 
 def by_name(holds: Callable[[Any], Any], what: str) -> Rule:
@@ -225,7 +213,7 @@ def by_name(holds: Callable[[Any], Any], what: str) -> Rule:
     def all_hold(value: Any) -> bool:
         return isinstance(value, Mapping) and all(map(holds, value.values()))
 
-    return of(lambda value: value is None or all_hold(value), f"a mapping from names to {what}")
+    return Rule(lambda value: value is None or all_hold(value), f"a mapping from names to {what}")
 
 
 def entries(holds: Callable[[np.ndarray], Any], what: str) -> Rule:
@@ -240,7 +228,7 @@ def entries(holds: Callable[[np.ndarray], Any], what: str) -> Rule:
         is_numeric = _has_numbers(array if hasattr(array, "dtype") else np.asarray(array))
         return is_numeric and np.size(array) > 0 and bool(np.all(holds(np.asarray(array))))
 
-    return of(all_hold, what)
+    return Rule(all_hold, what)
 
 
 def _is_covariance(array: np.ndarray) -> bool:
@@ -270,7 +258,7 @@ def check(hint: Any, what: str = "", /, **arguments: Any) -> None:
     """Check each argument by an annotation; `what` says in words what it should be."""
     rule = _rule(hint) or _instance(hint)
     for name, value in arguments.items():
-        (of(rule.holds, what) if what else rule).check(value, name)
+        (Rule(rule.holds, what) if what else rule).check(value, name)
 
 
 class Checked(eqx.Module):
@@ -316,8 +304,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
-# By class: how an argument of it is checked, if not as an instance.
-CHECKS: dict[type, Callable[[Any, str], None]] = {}
+# By class: the rule for an argument of it, where it need not be an instance.
+RULES: dict[type, Rule] = {}
 
 
 @functools.cache
@@ -363,27 +351,27 @@ def _rule(hint: Any) -> Rule | None:
         known = [rule for choice in choices if (rule := _rule(choice)) is not None]
         holds = lambda value: any(rule.holds(value) for rule in known)  # noqa: E731
         what = " or ".join(rule.what for rule in known)
-        return of(holds, what) if len(known) == len(choices) else None
+        return Rule(holds, what) if len(known) == len(choices) else None
     if origin is Literal:
         return one_of(choices)
     if origin is Callable:
-        return of(lambda value: callable(value) and not isinstance(value, type), "a function")
+        return Rule(lambda value: callable(value) and not isinstance(value, type), "a function")
     if hint is bool:
-        return of(lambda value: isinstance(value, bool | np.bool_), "True or False")
+        return Rule(lambda value: isinstance(value, bool | np.bool_), "True or False")
     if hint is types.NoneType:
-        return of(lambda value: value is None, "None")
+        return Rule(lambda value: value is None, "None")
     if getattr(hint, "dtype", None) is jaxtyping.Key:
         made = "split(jax.random.key(0), runs)" if hint.dims else "key(0)"
         has_keys = lambda value: isinstance(value, hint) and value.size > 0  # noqa: E731
-        return of(has_keys, f"of typed keys, as jax.random.{made}")
-    if hint in CHECKS:
-        return Rule(CHECKS[hint], hint.__name__)
+        return Rule(has_keys, f"of typed keys, as jax.random.{made}")
+    if hint in RULES:
+        return RULES[hint]
     return _instance(hint) if isinstance(hint, type) and _is_ours(hint) else None
 
 
 def _instance(kind: type) -> Rule:
     article = "an" if kind.__name__[0] in "AEIO" else "a"
-    return of(lambda value: isinstance(value, kind), f"{article} {kind.__name__}")
+    return Rule(lambda value: isinstance(value, kind), f"{article} {kind.__name__}")
 
 
 def optional(module: str, package: str) -> types.ModuleType:

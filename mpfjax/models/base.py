@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import CHECKS, Count, check, check_one_each, kinds, shown
+from mpfjax.checks import RULES, Count, Rule, check, check_one_each, kinds, shown
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.random import direction_numbers, normal, split
 
@@ -200,7 +200,16 @@ def require_model(model: Any, argument: str) -> None:
         ) from error
 
 
-CHECKS[AbstractStateSpaceModel] = require_model
+class _ModelRule(Rule):
+    """A model has the methods, whether it is an `AbstractStateSpaceModel` or not."""
+
+    def check(self, value: Any, name: str) -> None:
+        require_model(value, name)
+
+
+RULES[AbstractStateSpaceModel] = _ModelRule(
+    lambda model: hasattr(model, "log_likelihood"), "a model"
+)
 
 
 def check_states(states: Any, model: Any, method: str, num_particles: int) -> None:
@@ -237,7 +246,7 @@ def real_each(values: Any, who: str, num_particles: int) -> Float[Array, " n"]:
 # particles share.
 _BATCHED = (
     "log_transition", "log_initial", "with_history", "initial_from_noise", "transition_from_noise",
-    "transition_mean", "observation_mean",
+    "transition_mean", "observation_mean", "sample_observation",
 )  # fmt: skip
 _SHARED = (
     "transition_covariance", "observation_covariance", "prepare_observation", "noise_dimension",
@@ -274,9 +283,7 @@ class _PerParticleModel(AbstractStateSpaceModel):
         # looks for are there exactly when the wrapped model has them.
         model = self.__dict__.get("model")
         if name in _BATCHED and hasattr(model, name):
-            return jax.vmap(getattr(model, name))
-        if name == "sample_observation" and hasattr(model, name):
-            return _OverParticles(getattr(model, name), draws=True)
+            return _OverParticles(getattr(model, name), draws=name == "sample_observation")
         if name in _SHARED and hasattr(model, name):
             return getattr(model, name)
         raise AttributeError(f"{type(model).__name__} (per_particle) has no attribute {name!r}")
@@ -325,8 +332,8 @@ def per_particle(model: Any) -> AbstractStateSpaceModel:
 
     Raises `ValueError` where one of the three methods is missing.
     """
-    from_noise = hasattr(model, "transition_from_noise") and hasattr(model, "noise_dimension")
-    for method in ("sample_initial", "sample_transition", "log_likelihood"):
-        if not (from_noise and method == "sample_transition"):
-            require(model, method, "per_particle")
+    law = "transition_from_noise"
+    law = law if hasattr(model, law) else "sample_transition"
+    for method in ("sample_initial", law, "log_likelihood"):
+        require(model, method, "per_particle")
     return _PerParticleModel(model)

@@ -233,15 +233,13 @@ def _shares_covariance(model: Any, state: MarginalisedState) -> bool:
     """
 
     def matrices(state: MarginalisedState) -> list[Array]:
-        _, initial = _initial_moments(model, state.latent)
-        found = [particles_last(initial, 2)]
-        for part in (
+        parts = (
+            particles_last(_initial_moments(model, state.latent)[1], 2),
             dynamics_of(model, state.latent, state),
             emission_of(model, state.latent, state),
             latent_dynamics_of(model, state) if is_mixed(model) else None,
-        ):
-            found += [leaf for leaf in jax.tree.leaves(part) if leaf.ndim == 3]
-        return found
+        )
+        return [leaf for leaf in jax.tree.leaves(parts) if leaf.ndim == 3]
 
     return all(matrix.shape[-1] == 1 for matrix in jax.eval_shape(matrices, state))
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import saying
+from mpfjax.checks import kinds, saying
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models import gaussians
 from mpfjax.models.base import check_log_density, check_moved, model_name
@@ -104,10 +104,8 @@ def seen(
 
 def own_likelihoods(model: Any, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
     """The model's own `log_likelihood`, of a latent without what is seen of x, checked."""
-    leaves = [f"{leaf.dtype}{list(leaf.shape)}" for leaf in jax.tree.leaves(observation)]
-    of_what = f"{', '.join(leaves)} in {jax.tree.structure(observation)}"
     who = f"model: {model_name(model)}.log_likelihood"
-    with saying(f"in {who}, of an observation (a step of the observations) that is {of_what}"):
+    with saying(f"in {who}, of a step of the observations that is {kinds(observation)}"):
         values = model.log_likelihood(observation, states)
     num_particles = jax.tree.leaves(states)[0].shape[0]
     return check_log_density(values, model, "log_likelihood", num_particles)

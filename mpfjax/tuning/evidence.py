@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import kinds, of
+from mpfjax.checks import Rule, kinds
 from mpfjax.filter import Filter
 from mpfjax.models.observations import Series, as_series, gathered
 from mpfjax.moves.base import AbstractMove
@@ -19,7 +19,7 @@ from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, placed
 
 UnbiasedFilter = Annotated[
     Filter,
-    of(
+    Rule(
         lambda value: isinstance(value, Filter) and not value.approximate,
         "a filter with an unbiased likelihood: none of its moves is approximate",
     ),

@@ -11,7 +11,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import Count, CountOrZero, checked, of, shown
+from mpfjax.checks import Count, CountOrZero, Rule, checked, shown
 from mpfjax.filter import Filter
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.curvature import errors_at
@@ -20,7 +20,7 @@ from mpfjax.tuning.problem import Objective, Parameters, Problem, Reals, Transfo
 
 Optimizer = Annotated[
     optax.GradientTransformation,
-    of(
+    Rule(
         lambda value: not isinstance(value, type) and callable(getattr(value, "update", None)),
         "an optimiser of optax, as optax.adam(0.05)",
     ),

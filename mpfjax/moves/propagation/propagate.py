@@ -219,6 +219,9 @@ class Reweight(AbstractPropagation):
     model: AbstractStateSpaceModel
     exponent: Exponent = eqx.field(static=True, default=1.0)
 
+    keeps_trajectories = True
+    """it weighs the trajectory as any other."""
+
     def __check_init__(self) -> None:
         super().__check_init__()
         if self.exponent != 1:
@@ -236,11 +239,6 @@ class Reweight(AbstractPropagation):
         # Differences would be lost to rounding beside a large common constant.
         common = finite_max(jnp.where(mixture.occupied, log_factors, -jnp.inf))
         return mixture.weighed(self.exponent * (log_factors - common), self.exponent * common[None])
-
-    def around(self, reference: Reference) -> "Reweight":
-        """The move itself, which weighs the trajectory as any other."""
-        del reference
-        return self
 
 
 def noise_of_slots(

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import of, saying
+from mpfjax.checks import Rule, saying
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import real_each
 from mpfjax.moves.base import AbstractMove
@@ -14,7 +14,7 @@ from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
 
-_LOOKAHEAD = of(
+_LOOKAHEAD = Rule(
     lambda look: (
         not isinstance(look, type)
         and (callable(look) or hasattr(look, "log_normaliser") or hasattr(look, "at_step_of"))
