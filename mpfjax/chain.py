@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import kinds, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, saying_that_none_were_given, with_inputs
+from mpfjax.models.base import AbstractStateSpaceModel, with_inputs
 from mpfjax.models.observations import Fault, faults_of
 from mpfjax.moves.base import AbstractMove, Moves, name_of, with_inner, without_dead
 from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
@@ -123,14 +123,13 @@ def moved_by(
     resampled before y_1 has weighed its particles too: that would undo a choice by y_1.
     """
     moves, none = filter.moves, jnp.zeros(mixture.num_components, bool)
-    with saying_that_none_were_given(filter.model):
-        if observation is None:
-            return check_result(move.predict(key, mixture), mixture, move), none
-        if move.propagates and mixture.parents is None and any(m.needs_parents for m in moves):
-            mixture = mixture.replace(parents=mixture.particles)
-        resampled = move.would_resample(mixture, observation)
-        after = (lambda moved: forgetting(moves, moved),) if move.inner else ()
-        moved = check_result(move(key, mixture, observation, *after), mixture, move)
+    if observation is None:
+        return check_result(move.predict(key, mixture), mixture, move), none
+    if move.propagates and mixture.parents is None and any(m.needs_parents for m in moves):
+        mixture = mixture.replace(parents=mixture.particles)
+    resampled = move.would_resample(mixture, observation)
+    after = (lambda moved: forgetting(moves, moved),) if move.inner else ()
+    moved = check_result(move(key, mixture, observation, *after), mixture, move)
     if move.propagates:
         return moved.replace(in_order=False), resampled
     if not (move.resamples and filter.looks_at_first):

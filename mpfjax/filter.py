@@ -24,7 +24,7 @@ from mpfjax.chain import (
 )
 from mpfjax.checks import Count, checked
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import AbstractStateSpaceModel, saying_that_none_were_given
+from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import Noise
 from mpfjax.models.observations import one_input, one_observation, raise_faults
 from mpfjax.moves.base import AbstractMove, as_moves, initial_memory
@@ -132,9 +132,8 @@ class Filter(eqx.Module):
             particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
         mixture = single_component(particles, self.num_components)
         mixture = mixture.replace(memory=initial_memory(self.moves, self.num_components))
-        with saying_that_none_were_given(self.model):
-            for move_key, move in zip(keys, self.initial_moves, strict=True):
-                mixture = move(move_key, mixture, observation)
+        for move_key, move in zip(keys, self.initial_moves, strict=True):
+            mixture = move(move_key, mixture, observation)
         if self.looks_at_first:
             mixture, log_mass = normalised(mixture, mixture)
             mixture = mixture.replace(log_scale=log_mass)

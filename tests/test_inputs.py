@@ -338,17 +338,3 @@ def test_nothing_compiles_again():
     before = len(TRACED)
     run(inputs=jax.tree.map(lambda leaf: 0.5 * leaf, INPUTS))
     assert len(TRACED) == before > 0
-
-
-def test_an_error_where_none_were_given_says_so():
-    """The model fails on None, by whatever error; models that do without are not refused."""
-    mixture = FILTER.init(KEY)
-    for call in (
-        lambda: run(inputs=None),
-        lambda: FILTER.step(KEY, mixture, OBSERVATIONS[0]),
-        lambda: mpfjax.forecast(KEY, FILTER, mixture, 2),
-        lambda: sample_trajectories(KEY, Driven(), run(collect=None), 5),
-    ):
-        with pytest.raises(TypeError) as caught:
-            call()
-        assert "inputs: there are none, so Driven" in "".join(caught.value.__notes__)

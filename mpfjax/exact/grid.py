@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import real_array, shown
-from mpfjax.models.base import check_log_density, require, saying_that_none_were_given, with_inputs
+from mpfjax.models.base import check_log_density, require, with_inputs
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.observations import Series, as_series
 from mpfjax.models.steps import likelihoods
@@ -77,8 +77,7 @@ def grid_filter(
     else:
         log_initial = real_array(str(len(points)), "log_initial", log_initial)
     series = as_series(observations, model, inputs, missing)
-    with saying_that_none_were_given(model):
-        return _grid_filter(model, series, points, width, log_initial, state_shape)
+    return _grid_filter(model, series, points, width, log_initial, state_shape)
 
 
 def _width(grid: Any) -> Any:

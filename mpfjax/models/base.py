@@ -3,10 +3,9 @@ wrapper for models of one particle.
 """
 
 import abc
-import contextlib
 import copy
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -114,26 +113,6 @@ def replaced(model: Any, **fields: Any) -> Any:
     for name, value in fields.items():
         object.__setattr__(changed, name, value)
     return changed
-
-
-@contextlib.contextmanager
-def saying_that_none_were_given(model: Any) -> Iterator[None]:
-    """Add to an error about None that the model's field `inputs` is None.
-
-    A model may do without inputs. So whether it needs them is known only where it fails.
-    """
-    try:
-        yield
-    except Exception as error:
-        model = _innermost(model)
-        note = (
-            f"mpfjax: inputs: there are none, so {type(model).__name__}.inputs is None; give"
-            " u_1, ..., u_t by inputs=... (x_0 has no input)"
-        )
-        said = getattr(error, "__notes__", [])
-        if getattr(model, "inputs", 0) is None and "None" in str(error) and note not in said:
-            error.add_note(note)
-        raise
 
 
 def is_made_of_noise(model: Any, state: str = "transition") -> bool:

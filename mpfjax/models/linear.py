@@ -24,7 +24,6 @@ from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 from mpfjax.operations.random import normal, uniform
 from mpfjax.operations.segments import spread
 
-_IN_TIME = ("A", "Q", "H", "R", "B", "inputs")
 # Sums of probabilities may differ from one by this much, for rounding.
 _ROUNDING = 1e-4
 PROBABILITIES = entries(
@@ -69,9 +68,6 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
     def with_inputs(self, inputs: PyTree) -> "LinearGaussianModel":
         """The model at step t: u_t, (k,), or a dict of the fields that change in time."""
         fields = inputs if isinstance(inputs, dict) else {"inputs": inputs}
-        unknown = sorted(set(fields) - set(_IN_TIME))
-        if unknown:
-            raise ValueError(f"inputs: {unknown} are not among {list(_IN_TIME)}")
         return dataclasses.replace(self, **fields)
 
     @property

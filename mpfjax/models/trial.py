@@ -20,7 +20,6 @@ from mpfjax.models.base import (
     model_name,
     require,
     require_noise,
-    saying_that_none_were_given,
     with_inputs,
 )
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
@@ -61,9 +60,8 @@ def check_model(
     inputs, observation = one_input(inputs, model), one_observation(observation)
     if is_made_of_noise(model):
         require_noise(model, "check_model")
-    with saying_that_none_were_given(model):
-        for fault in _faults(key, model, observation, inputs):
-            raise ValueError(f"model: {model_name(model)}.{fault}")
+    for fault in _faults(key, model, observation, inputs):
+        raise ValueError(f"model: {model_name(model)}.{fault}")
 
 
 def _faults(key: Key[Array, ""], model: Any, observation: PyTree, inputs: PyTree) -> Iterator[str]:
@@ -181,8 +179,7 @@ def simulate(
     """`AbstractStateSpaceModel.simulate`."""
     require(model, "sample_observation", "simulate")
     inputs = steps_of_inputs(inputs, num_steps, model, "steps")
-    with saying_that_none_were_given(model):
-        return with_floats_traced(lambda model: _simulate(key, model, num_steps, inputs), model)
+    return with_floats_traced(lambda model: _simulate(key, model, num_steps, inputs), model)
 
 
 @jit_on_wide_vectors

@@ -14,7 +14,6 @@ from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_states,
     is_made_of_noise,
-    saying_that_none_were_given,
 )
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.noise import Noise, draw_noise
@@ -48,15 +47,14 @@ def sample_initial(
     noise: str = "independent",
 ) -> PyTree:
     """The particles of x_0, of this noise if the model can; raises for leaves of another length."""
-    with saying_that_none_were_given(model):
-        if noise == "independent" or not is_made_of_noise(model, "initial"):
-            particles = model.sample_initial(key, num_particles)
-        else:
-            maker = cast(Any, model)
-            shape = (num_particles, maker.initial_noise_dimension)
-            particles = maker.initial_from_noise(draw_noise(noise, key, shape, default_float()))
-        check_states(particles, model, "sample_initial", num_particles)
-        return with_moments(model, particles)
+    if noise == "independent" or not is_made_of_noise(model, "initial"):
+        particles = model.sample_initial(key, num_particles)
+    else:
+        maker = cast(Any, model)
+        shape = (num_particles, maker.initial_noise_dimension)
+        particles = maker.initial_from_noise(draw_noise(noise, key, shape, default_float()))
+    check_states(particles, model, "sample_initial", num_particles)
+    return with_moments(model, particles)
 
 
 class SelectInitial(AbstractMove):

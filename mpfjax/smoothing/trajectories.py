@@ -14,7 +14,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     require,
-    saying_that_none_were_given,
     with_inputs,
 )
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
@@ -97,8 +96,7 @@ def sample_trajectories(
         if method == "mcmc":
             stacked = with_parents(stacked, "sample_trajectories with method 'mcmc'")
         options = (num_trajectories, component, 0 if method == "exact" else num_steps or 1)
-        with saying_that_none_were_given(model):
-            drawn, indices = draw_trajectories(key, model, stacked, inputs, *options)
+        drawn, indices = draw_trajectories(key, model, stacked, inputs, *options)
     _warn_of_few(indices, stacked.log_weights)
     return drawn
 
