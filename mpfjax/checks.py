@@ -280,8 +280,9 @@ class Fitting(Checked):
         super().__check_init__()
         fitting: dict[str, tuple[int, ...]] = {}
         with jaxtyping.jaxtyped("context"):
-            for name, kinds in _arrays(type(self)).items():
-                if (value := getattr(self, name)) is None:
+            for name, hint in _hints(type(self)).items():
+                value, kinds = getattr(self, name), _array_kinds(hint)
+                if not kinds or not hasattr(value, "shape"):
                     continue
                 if not isinstance(value, kinds):
                     axes = " or ".join(f"({', '.join(kind.dim_str.split())})" for kind in kinds)
@@ -315,12 +316,6 @@ def _rules(owner: Any) -> dict[str, Rule]:
     return {name: rule for name, rule in rules.items() if rule is not None}
 
 
-@functools.cache
-def _arrays(owner: type) -> dict[str, tuple[Any, ...]]:
-    """By name, the kinds of array that a field may be."""
-    return {name: kinds for name, hint in _hints(owner).items() if (kinds := _array_kinds(hint))}
-
-
 def _array_kinds(hint: Any) -> tuple[Any, ...]:
     if isinstance(hint, type) and hasattr(hint, "dim_str"):
         return (hint,)
@@ -328,6 +323,7 @@ def _array_kinds(hint: Any) -> tuple[Any, ...]:
     return tuple(kind for part in parts for kind in _array_kinds(part))
 
 
+@functools.cache
 def _hints(owner: Any) -> dict[str, Any]:
     is_class = isinstance(owner, type)
     # A user's subclass says by its annotations what it likes.

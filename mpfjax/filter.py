@@ -58,7 +58,7 @@ class Filter(eqx.Module):
     _initial_moves: tuple[Any, ...]
     num_particles: int = eqx.field(static=True)
     num_components: int = eqx.field(static=True)
-    initial_noise: str = eqx.field(static=True)
+    initial_noise: Noise = eqx.field(static=True)
 
     @checked
     def __init__(

@@ -270,11 +270,9 @@ class ParticleMixture(eqx.Module):
     def _require_one(self) -> None:
         shape = self.log_weights.shape
         if len(shape) != 1:
-            raise ValueError(
-                f"mixture: a stack of {' x '.join(map(str, shape[:-1]))} mixtures has no such"
-                " property of its own; jax.vmap over the leading axes, as in"
-                " jax.vmap(lambda mixture: mixture.mean())(mixtures)"
-            )
+            how = "jax.vmap(lambda mixture: mixture.mean())(mixtures)"
+            stack = " x ".join(map(str, shape[:-1]))
+            raise ValueError(f"mixture: a stack of {stack} mixtures has no property of one; {how}")
 
 
 _OF_SLOTS = ("particles", "log_weights", "component_indicators", "ancestor_indices", "parents")

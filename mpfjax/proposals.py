@@ -181,7 +181,7 @@ class GaussNewtonProposal(_GaussianProposal):
         self, noise: Float[Array, "n d"], factors: Float[Array, "n d d"]
     ) -> Float[Array, " n"]:
         """log q of draws that were made of this noise."""
-        log_scale = jnp.sum(jnp.log(_diagonals(factors)), axis=1)
+        log_scale = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
         log_density = (
             log_scale
             - noise.shape[1] * (jnp.log(self.inflation) + 0.5 * jnp.log(2 * jnp.pi))
@@ -210,7 +210,7 @@ class GaussNewtonProposal(_GaussianProposal):
         moved = means - prior_means.reshape(means.shape)
         squares = jnp.einsum("np,pq,nq->n", missed, _inverse(covariance_y), missed)
         squares = squares + jnp.einsum("nd,de,ne->n", moved, _inverse(covariance), moved)
-        log_volume = -jnp.sum(jnp.log(_diagonals(factors)), axis=1)
+        log_volume = -jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
         log_scale = 0.5 * (
             covariance_y.shape[0] * jnp.log(2 * jnp.pi)
             + jnp.linalg.slogdet(covariance_y)[1]
@@ -262,10 +262,6 @@ def _solve_transposed(
         rest = vectors[:, i] - jnp.sum(factors[:, :, i] * solved, axis=1)
         solved = solved.at[:, i].set(rest / factors[:, i, i])
     return solved
-
-
-def _diagonals(factors: Float[Array, "n d d"]) -> Float[Array, "n d"]:
-    return jnp.diagonal(factors, axis1=1, axis2=2)
 
 
 def _matrix(covariance: Float[Array, "..."]) -> Float[Array, "d d"]:

@@ -84,14 +84,12 @@ def _width(grid: Any) -> Any:
     """The width of a cell, from both ends: that of two neighbours is mostly rounding."""
     if not isinstance(grid, Tracer):
         grid = np.asarray(grid, float)
-    return (grid[-1] - grid[0]) / (grid.shape[0] - 1)
+    return (grid[-1] - grid[0]) / max(grid.shape[0] - 1, 1)
 
 
 def _checked_grid(grid: Any) -> tuple[Float[Array, " g"], Any]:
     """The points and the width; a `ValueError` unless they ascend evenly, as far as is known."""
     points = real_array("points", "grid", grid)
-    if len(points) < 2:
-        raise ValueError(f"grid: shape {points.shape} is not that of two points or more")
     width = _width(grid)
     if not isinstance(points, Tracer):
         known = np.asarray(points)  # within a caller's jit, too

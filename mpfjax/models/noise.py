@@ -1,14 +1,13 @@
 """Standard normal and uniform draws: independent, or spread evenly over particles."""
 
 from functools import partial
-from typing import Annotated
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
-from mpfjax.checks import one_of
 from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import (
     MOST_DIMENSIONS,
@@ -24,8 +23,7 @@ from mpfjax.operations.random import (
 from mpfjax.operations.segments import first_places, spread
 from mpfjax.operations.stored import stored
 
-NOISES = ("independent", "rqmc")
-Noise = Annotated[str, one_of(NOISES)]
+Noise = Literal["independent", "rqmc"]
 _UNUSED = 9  # bits of 32 that no draw of 23 bits shows
 
 

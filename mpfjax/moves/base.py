@@ -3,17 +3,17 @@
 import abc
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Iterator
-from typing import Annotated, Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import Checked, check, is_series, one_of, shown
+from mpfjax.checks import Checked, check, is_series, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.logarithms import without_gradient
 
-Gradient = Annotated[str, one_of(("none", "stop"))]
+Gradient = Literal["none", "stop"]
 
 
 class AbstractMove(Checked):

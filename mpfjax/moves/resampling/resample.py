@@ -1,7 +1,7 @@
 """Resampling within components: systematic, stratified, multinomial, residual or SSP."""
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Literal
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import stored, take
 
 Scheme = Annotated[str, one_of(SCHEMES)]
-Allocation = Annotated[str, one_of(("variance", "equal"))]
+Allocation = Literal["variance", "equal"]
 
 
 class Resample(AbstractResampling):
