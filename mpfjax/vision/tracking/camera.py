@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mpfjax.vision.tracking.associate import argmax_pairs
+from mpfjax.vision.tracking.associate import argmax_pairs, mahalanobis
 from mpfjax.vision.tracking.gaussian import Gaussian, zeros
 
 _FREEDOM = 4.0  # degrees, of Student's distribution of what objects do on their own
@@ -15,6 +15,7 @@ _ROUNDS = 5
 _RATE = 0.03  # of forgetting
 _STILL = 0.02  # the deviation of the camera's motion before anything is known, in boxes
 _LEAST, _MOST = 1e-3, 0.5
+_LEADERS, _NEAREST = 8, 2  # whose detections, and how many of each, a jolt is sought by
 _PRIOR = 5.0  # frames of many objects that the first deviation counts as
 
 
@@ -38,7 +39,7 @@ class CameraState(NamedTuple):
     def after(
         self,
         predicted: Gaussian,
-        gone: Float[Array, "m 2"] | None,
+        gone: Float[Array, "#m 2"],
         known: Bool[Array, ""],
         cost: Float[Array, "m d"],
         errors: Float[Array, "4"],
@@ -56,8 +57,8 @@ class CameraState(NamedTuple):
         with heavy-tailed noise for objects that move on their own. The posterior mean of c is
         computed by iterated weighted least squares, with Student's weights. σ_c² is the mean
         product of the innovations of different objects: their own noises are independent. `gone`
-        is by how much the motion from pixels has moved each object: where it is `known`, c is what
-        is left.
+        is by how much a jolt, or the motion from pixels, has moved each object: where the latter is
+        `known`, c is what is left.
         """
         partner = argmax_pairs(jnp.maximum(-cost, 0.0))
         paired = (partner >= 0)[:, None]
@@ -76,10 +77,47 @@ class CameraState(NamedTuple):
         n = jnp.sum(paired, dtype=gaps.dtype)
         told = jnp.maximum(n - 1, 0.0) / (n + 3)  # two objects tell less than many
         weight = jnp.minimum(self.weight + told, 1 / _RATE)
-        all_of_it = gaps if gone is None else jnp.where(paired, gaps + gone, 0.0)
+        all_of_it = jnp.where(paired, gaps + gone, 0.0)
         deviations = _learned(self.deviations, all_of_it / box[None], n, told / weight)
         left = jnp.where(known, _learned(self.left, gaps / box[None], n, told / weight), self.left)
         return CameraState(deviations, left, weight), shift
+
+
+def jolted(
+    predicted: Gaussian,
+    errors: Float[Array, "4"],
+    places: Float[Array, "d 4"],
+    unlike: Float[Array, "m d"],
+    seen: Int[Array, " m"],
+) -> Float[Array, "2"]:
+    """The shift of a jolt that leaves most objects without a detection, zero if there was none.
+
+    `unlike` is infinite where the two are no pair, and `seen` is 0 for what was not seen lately.
+    Where fewer than half of the objects have a detection near them, the shifts that bring one of
+    the eight longest seen to one of the two detections next to it are tried: a camera moves all by
+    the same. The one that explains most counts, if that is half of them and two more than before.
+    """
+    number = jnp.sum(seen > 0, dtype=jnp.int32)
+
+    def explained(shift: Float[Array, "2"]) -> Int[Array, ""]:
+        cost = mahalanobis(predicted.shifted(shift), errors, places) + unlike
+        near = jnp.any(cost < 0, axis=1) & (seen > 0)
+        return jnp.sum(near, dtype=jnp.int32)
+
+    def tried() -> Float[Array, "2"]:
+        leaders = jax.lax.top_k(seen, min(_LEADERS, len(seen)))[1]
+        gaps = places[None, :, :2] - predicted.place[leaders, None, :2]
+        far = jnp.sum((gaps / predicted.unit[leaders, None, :2]) ** 2, axis=2) + unlike[leaders]
+        nearest = jax.lax.top_k(-far, min(_NEAREST, len(places)))[1]
+        shifts = jnp.take_along_axis(gaps, nearest[..., None], axis=1).reshape(-1, 2)
+        numbers = jax.vmap(explained)(shifts)
+        best = jnp.argmax(numbers)
+        found = (numbers[best] > still + 1) & (2 * numbers[best] >= number)
+        return jnp.where(found, shifts[best], 0.0)
+
+    zero = jnp.zeros(2, places.dtype)
+    still = explained(zero)
+    return jax.lax.cond(2 * still < number, tried, lambda: zero)
 
 
 def _learned(

@@ -21,7 +21,7 @@ from mpfjax.vision.tracking.associate import (
     stronger,
     unlikeness,
 )
-from mpfjax.vision.tracking.camera import CameraState
+from mpfjax.vision.tracking.camera import CameraState, jolted
 from mpfjax.vision.tracking.detections import DetectedBoxes, Detections
 from mpfjax.vision.tracking.gaussian import (
     CameraMotion,
@@ -296,7 +296,7 @@ def _moved(
     motion: CameraMotion | None,
 ) -> tuple[Gaussian, NoiseState, CameraState, Float[Array, "2"]]:
     """Objects a frame later, moved with the camera, and by how far that was."""
-    before, noise, gone = state.objects, state.noise, None
+    before, noise, gone = state.objects, state.noise, jnp.zeros((1, 2))
     deviations = state.camera.deviations
     if motion is not None:
         carried = motion.carried(before)
@@ -305,7 +305,11 @@ def _moved(
         deviations = jnp.where(motion.known, state.camera.left, deviations)
     errors, place, velocity, _ = noise.noises
     objects = before.predicted(place[None], velocity[None])
-    confirmed = state.lives.confirmed
+    confirmed, lately = state.lives.confirmed, state.lives.unseen == 0
+    pairs = jnp.where(found.strong(state.scores.weak)[None], unlike, jnp.inf)
+    seen = jnp.where(confirmed & lately, state.lives.seen, 0)
+    jolt = jolted(objects, errors, found.places, pairs, seen)
+    objects, gone = objects.shifted(jolt), gone + jolt[None]
     number = jnp.maximum(jnp.sum(confirmed, dtype=objects.place.dtype), 1.0)
     box = jnp.exp(jnp.sum(jnp.where(confirmed[:, None], objects.place[:, 2:], 0.0), 0) / number)
     cost = mahalanobis(objects, errors, found.places, 2 * deviations * box) + unlike
@@ -313,8 +317,8 @@ def _moved(
     cost = jnp.where(pairs, cost, jnp.inf)
     known = jnp.asarray(False) if motion is None else jnp.asarray(motion.known)
     camera, shift = state.camera.after(objects, gone, known, cost, errors, found.places, box)
-    noise = noise._replace(moments=noise.moments.shifted(shift))
-    return objects.shifted(shift), noise, camera, shift
+    noise = noise._replace(moments=noise.moments.shifted(jolt + shift))
+    return objects.shifted(shift), noise, camera, jolt + shift
 
 
 def _associated(
