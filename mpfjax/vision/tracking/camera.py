@@ -112,12 +112,12 @@ def jolted(
         shifts = jnp.take_along_axis(gaps, nearest[..., None], axis=1).reshape(-1, 2)
         numbers = jax.vmap(explained)(shifts)
         best = jnp.argmax(numbers)
-        found = (numbers[best] > still + 1) & (2 * numbers[best] >= number)
+        found = (numbers[best] > still + 1) & (4 * numbers[best] >= 3 * number)
         return jnp.where(found, shifts[best], 0.0)
 
     zero = jnp.zeros(2, places.dtype)
     still = explained(zero)
-    return jax.lax.cond(2 * still < number, tried, lambda: zero)
+    return jax.lax.cond(2 * still <= number, tried, lambda: zero)
 
 
 def _learned(
