@@ -64,14 +64,13 @@ def _draw_history(axis: Axes, history: Mapping[str, Any], truth: np.ndarray) -> 
 def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str]) -> Figure:
     """Figure 2 of Vermaak et al. (2003), and the error of the modes' mass beside it."""
     entries = sorted(results, key=lambda entry: list(labels).index(entry["filter"]))
-    mixtures = [entry for entry in entries if entry["filter"] != "pf"]
 
     def score(entry: Mapping[str, Any], k: int) -> float:
         # A score lies in [0, 1]: the bars end there too.
         return float(np.clip(np.mean(entry["scores"]) + k * np.std(entry["scores"]), 0, 1))
 
     scores = [lambda e, k=k: score(e, k) for k in (0, -1, 1)]
-    weights = [lambda e, k=k: e["weight_mean"] + k * e["weight_std"] for k in (0, -1, 1)]
+    masses = [lambda e, k=k: e["mass_mean"] + k * e["mass_std"] for k in (0, -1, 1)]
     at = (lambda e: labels[e["filter"]], "particles")
     x, limits = "number of particles $N$", (-0.03, 1.06)
     panels = [
@@ -81,12 +80,11 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
             lines_of(entries, *at, *scores), limits,
         ),
         Panel(
-            "weight of component one, mean ± std", x, r"mixture weight $\pi_1$",
-            lines_of(mixtures, *at, *weights), limits,
+            "probability of the upper mode, mean ± std", x, r"$P(x_t > 0 \mid y_1 \ldots y_t)$",
+            lines_of(entries, *at, *masses), limits,
         ),
         Panel(
-            "RMS error of the upper mode's mass", x,
-            r"error of $P(x_t > 0 \mid y_1 \ldots y_t)$",
+            "its RMS error", x, r"error of $P(x_t > 0 \mid y_1 \ldots y_t)$",
             lines_of(entries, *at, "mode_mass_error"), (0, None),
         ),
     ]  # fmt: skip
@@ -94,26 +92,26 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
 
 
 def draw_contact_sheet(
-    rows: Sequence[tuple[str, Sequence[np.ndarray]]], titles: Sequence[str]
+    columns: Sequence[tuple[str, Sequence[np.ndarray]]], titles: Sequence[str]
 ) -> Figure:
-    """Figure 3 of Vermaak et al. (2003): a named row of pictures for each filter.
+    """Figure 3 of Vermaak et al. (2003): a named column of pictures for each filter.
 
-    Each row is a name and its RGB pictures, all of one size, one for each of the `titles`, which
-    stand above the pictures.
+    Each column is a name and its RGB pictures, all of one size, one for each of the `titles`, which
+    stand beside the pictures.
     """
-    height, width, _ = rows[0][1][0].shape
-    panel = 3.2
+    height, width, _ = columns[0][1][0].shape
+    panel = 10.0 / len(columns)
     figure = Figure(
-        figsize=(panel * len(titles), (panel * height / width + 0.3) * len(rows)),
-        layout="constrained",
+        figsize=(10.0, (panel * height / width + 0.1) * len(titles) + 0.3), layout="constrained"
     )
-    axes = figure.subplots(len(rows), len(titles), squeeze=False)
-    for row, (name, pictures) in zip(axes, rows, strict=True):
-        row[0].set_ylabel(name, fontsize=13)
-        for axis, picture, title in zip(row, pictures, titles, strict=True):
+    axes = figure.subplots(len(titles), len(columns), squeeze=False)
+    for column, (name, pictures) in zip(axes.T, columns, strict=True):
+        column[0].set_title(name, fontsize=13)
+        for axis, picture in zip(column, pictures, strict=True):
             axis.imshow(picture)
             axis.set(xticks=[], yticks=[])
-            axis.set_title(title, fontsize=12)
+    for axis, title in zip(axes[:, 0], titles, strict=True):
+        axis.set_ylabel(title, fontsize=12)
     return figure
 
 

@@ -326,13 +326,13 @@ def draw_migration(fewest: dict[str, Step], targets: Targets) -> Any:
     chosen = sorted({0, middle, closest, last})
     boxes = targets.truth.reshape(-1, 4)
     crop = plotting.region(boxes[:, :2], boxes[:, 2:], targets.stills.shape[1:])
-    rows = [
+    columns = [
         (NAMES[name], [_annotated(targets.stills[t], step, t, crop) for t in chosen])
         for name, step in fewest.items()
         if name != "gpf"
     ]
     titles = [f"frame {targets.first + t}" for t in chosen]
-    return plotting.draw_contact_sheet(rows, titles)
+    return plotting.draw_contact_sheet(columns, titles)
 
 
 def _annotated(still: np.ndarray, step: Step, t: int, crop: tuple[slice, slice]) -> np.ndarray:
@@ -340,7 +340,7 @@ def _annotated(still: np.ndarray, step: Step, t: int, crop: tuple[slice, slice])
     image, draw = drawing.canvas_of(still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1))
     corner = np.array([crop[1].start, crop[0].start], float)
     places = zoom * (step.centres[0, t] - corner)
-    drawing.draw_points(draw, places, step.target[0, t], 0.9 * zoom)
+    drawing.draw_points(draw, places, step.target[0, t], 1.2 * zoom)
     return np.asarray(image)
 
 

@@ -193,6 +193,8 @@ def summarise(runs: dict[str, Any], exact_mass: np.ndarray) -> dict[str, Any]:
         "scores": [float(score) for score in runs["both"].mean(axis=1)],
         "weight_mean": float(weights.mean()),
         "weight_std": float(weights.std()),
+        "mass_mean": float(runs["mass_above"].mean()),
+        "mass_std": float(runs["mass_above"].std()),
         "mode_mass_error": float(np.sqrt((error**2).mean())),
     }
 

@@ -213,11 +213,12 @@ def draw(results: list[dict[str, Any]]) -> Any:
     panels = []
     for job in dict.fromkeys(entry["job"] for entry in results):
         own = [e for e in results if e["job"] == job and e["median"] is not None]
-        lines = plotting.lines_of(
-            own, lambda e: LIBRARIES[e["library"]], "particles", lambda e: 1000 * e["median"]
-        )
+        # The median of the repeats, and where the middle half of them lies.
+        quartiles = [lambda e, q=q: 1000 * np.quantile(e["seconds"], q) for q in (0.5, 0.25, 0.75)]
+        name = lambda e: LIBRARIES[e["library"]]  # noqa: E731
+        lines = plotting.lines_of(own, name, "particles", *quartiles)
         title = f"{JOBS[job].title}, {JOBS[job].num_steps} steps"
-        axes = "number of particles $N$", "time of all runs [ms]"
+        axes = "number of particles $N$", "time of all runs (ms)"
         panels.append(plotting.Panel(title, *axes, lines))
     return plotting.draw_panels([panels])
 

@@ -151,17 +151,20 @@ def summary(truth: dict[str, np.ndarray], found: Draws) -> list[dict[str, Any]]:
 
 
 def picture(truth: dict[str, np.ndarray], found: Draws) -> Figure:
-    """For each parameter the density of every sampler's draws and the exact one."""
-    figure = Figure(figsize=(8, 3.4), layout="constrained")
-    for panel, (name, label) in zip(figure.subplots(1, 2), NAMES.items(), strict=True):
-        panel.plot(AXIS, truth[name], color="0.2", lw=2.2, label="grid filter")
-        wide = AXIS[truth[name] > 1e-3 * truth[name].max()]
-        for (sampler, draws), colour in zip(found.items(), plotting.COLOURS, strict=False):
-            panel.hist(
-                draws["values"][name], np.linspace(wide[0], wide[-1], 21), density=True,
-                weights=draws["weights"], histtype="step", color=colour, label=sampler,
-            )  # fmt: skip
-        panel.set(xlim=(wide[0], wide[-1]), xlabel=label, ylabel="posterior density")
+    """For each parameter the distribution function of every sampler's draws and the exact one."""
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    for panel, (name, label) in zip(figure.subplots(1, 2, sharey=True), NAMES.items(), strict=True):
+        shares = truth[name] * AXIS
+        exact = (np.cumsum(shares) - shares / 2) / shares.sum()
+        panel.plot(AXIS, exact, color="0.2", lw=4, alpha=0.3, label="grid filter, exact")
+        for (sampler, draws), colour, line in zip(
+            found.items(), plotting.COLOURS, ("-", "--", ":"), strict=False
+        ):
+            values, weights = draws["values"][name], draws["weights"]
+            panel.ecdf(values, weights, color=colour, ls=line, lw=1.4, label=sampler)
+        wide = AXIS[(exact > 1e-3) & (exact < 0.999)]
+        panel.set(xlim=(wide[0], wide[-1]), xlabel=label)
         panel.grid(alpha=0.25)
-    figure.axes[0].legend(fontsize=8)
+    figure.axes[0].set_ylabel("posterior distribution function")
+    figure.axes[0].legend(fontsize=8, loc="upper left")
     return figure

@@ -32,23 +32,23 @@ def write_video(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) 
 
 
 def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) -> None:
-    """Key frames in the manner of the paper's figure 3: a row for each filter, cropped to both."""
+    """Key frames in the manner of the paper's figure 3, cropped to most of the particles."""
     length = min(len(snapshots) for snapshots in tracked.values())
     chosen = np.unique(np.linspace(0, length - 1, KEY_FRAMES).round().astype(int))
     stills = {
         t: still for t, still in zip(range(length), source.read(), strict=False) if t in chosen
     }
     shown = [snapshots[t] for snapshots in tracked.values() for t in chosen]
-    points = [s.points[0][s.labels[0] >= 0] for s in shown]
+    points = [np.quantile(s.points[0][s.labels[0] >= 0], (0.1, 0.9), axis=0) for s in shown]
     points = np.concatenate([*points, box_files.centred(source.boxes)[:, :2]])
     crop = region(points, source.boxes[:, 2:], stills[0].shape)
     zoom = max(1, round(900 / (crop[1].stop - crop[1].start)))
-    rows = [
+    columns = [
         (
-            NAMES[name].replace(" ", "\n", 1),
+            NAMES[name],
             [annotate(stills[t], snapshots[t], zoom, crop) for t in chosen],
         )
         for name, snapshots in tracked.items()
     ]
     titles = [f"frame {source.first + t}" for t in chosen]
-    write_figure(path, draw_contact_sheet(rows, titles), dpi=110)
+    write_figure(path, draw_contact_sheet(columns, titles), dpi=110)
