@@ -24,6 +24,7 @@ from mpfjax.running.devices import choose_devices, over_threads
 from mpfjax.running.islands import IslandInteraction
 from tests import on_devices
 from tests.examples import make_mixture
+from tests.marking import exactness
 from tests.precision import float64
 from tests.unbiased import assert_unbiased
 from tests.user_models import TrickyQuadraticModel
@@ -284,7 +285,7 @@ class TestThreads:
         "limits",
         [
             {"_WORTH_A_THREAD": 1, "num_processors": lambda: 3},
-            {"_IN_CACHE": 100, "_IN_NEAR_CACHE": 80},
+            *exactness([{"_IN_CACHE": 100, "_IN_NEAR_CACHE": 80}]),
         ],
         ids=["on threads", "in groups"],
     )

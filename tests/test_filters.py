@@ -12,6 +12,7 @@ import pytest
 import mpfjax
 from mpfjax import Filter, Propagate, Resample
 from mpfjax.exact import kalman_filter
+from tests.marking import exactness
 from tests.registry import CHAINS
 from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import (
@@ -128,10 +129,10 @@ BOTH = eqx.tree_at(
 @pytest.mark.parametrize(
     ("model", "linear", "observations"),
     [
-        (LINEAR, LINEAR, [[1.0], [np.nan], [0.3]]),
         (TwoSensors(), BOTH, [[1.0, np.nan], [np.nan, 0.3], [0.4, 0.1]]),
+        *exactness([(LINEAR, LINEAR, [[1.0], [np.nan], [0.3]])]),
     ],
-    ids=["a step", "one of two sensors"],
+    ids=["one of two sensors", "a step"],
 )
 def test_what_is_missing_is_skipped_as_the_kalman_filter_does(model, linear, observations):
     filter, observations = mpfjax.particle_filter(model, 500), np.array(observations, np.float32)

@@ -106,6 +106,7 @@ def test_by_default_a_wide_prior_gets_many_draws(monkeypatch):
     assert squares[None] < 0.2 * squares[4], squares
 
 
+@pytest.mark.exactness
 def test_what_a_chain_weighs_before_it_propagates_counts():
     """x_0 is seen once more, with an error of 2, by a move at the head of the chain."""
 

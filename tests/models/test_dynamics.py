@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from mpfjax import Autoregression, RandomWalk, RandomWalkWithJumps, WalkWithVelocity
+from tests.marking import quick_of
 
 NUM = 20_000
 A1 = np.array([[1.2, 0.1], [0.0, 0.9]])
@@ -69,7 +70,7 @@ def test_the_density_is_scipys(name):
     np.testing.assert_allclose(found, np.log(expected), rtol=2e-4, atol=2e-4)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", quick_of(CASES, ["autoregression", "velocity"]))
 def test_a_set_of_parameters_for_each_particle(name):
     """Two particles of different dynamics, as each would be on its own."""
     dynamics, _, _ = CASES[name]

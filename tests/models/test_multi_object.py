@@ -83,8 +83,9 @@ class TestOneObjectAtATime:
         np.testing.assert_array_equal(marked[:, 1], STATES[:, 0])
         np.testing.assert_array_equal(marked[:, ::2], STATES[:, ::2])
 
-    @pytest.mark.parametrize("shared_observation", [False, True])
-    @pytest.mark.parametrize("object_model", [stack(OBJECTS), OBJECTS[0]], ids=["each", "one"])
+    @pytest.mark.parametrize(
+        ("object_model", "shared_observation"), [(stack(OBJECTS), False), (OBJECTS[0], True)]
+    )
     def test_densities(self, object_model, shared_observation):
         model = MultiObjectModel(object_model, NUM_OBJECTS, shared_observation=shared_observation)
         observation, of = OBSERVATION[0] if shared_observation else OBSERVATION, OWN

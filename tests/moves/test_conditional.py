@@ -25,7 +25,7 @@ CASES = {
     "ssp, adaptive, M = 2": (Resample("ssp", ess_threshold=0.8), 2),
     "systematic, M = 8": (Resample(), 8),
 }
-QUICK = ["systematic, M = 2", "ssp, M = 2", "systematic, fixed number, M = 2"]
+QUICK = ["systematic, M = 2", "ssp, M = 2"]
 over_cases = pytest.mark.parametrize("case", quick_of(CASES, QUICK))
 
 

@@ -21,7 +21,7 @@ CASES += [(name, 1) for name in PLAIN]
 # Each takes a program of its own; these are one of every kind.
 QUICK = [
     ("systematic", 1),
-    *((name, 3) for name in ("systematic", "stratified", "ssp", "systematic, sorted")),
+    *((name, 3) for name in ("systematic", "ssp")),
     *((name, 6) for name in ("residual", "multinomial, adaptive", "gaussian")),
     ("residual, fixed number, adaptive", 6),
 ]

@@ -9,7 +9,6 @@ import mpfjax
 from mpfjax import Filter, KMeans, Merge, Propagate, RandomPartition, Resample, Split
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.smoothing import conditional_filter
-from tests.marking import quick_of
 from tests.smoothing.registry import MODELS, QUADRATIC
 from tests.smoothing.test_contracts import NUM_RUNS, exact_trajectories
 
@@ -49,7 +48,6 @@ CASES = {
         True,
     ),
 }  # fmt: skip
-QUICK = ["many components, sorted, of fixed number"]  # the contracts have backward sampling
 
 
 def statistics(trajectories):
@@ -58,7 +56,8 @@ def statistics(trajectories):
     return np.concatenate([x, x**2, x[:, 1:] * x[:, :-1]], axis=1)
 
 
-@pytest.mark.parametrize("name", quick_of(CASES, QUICK))
+@pytest.mark.exactness  # one by default is in `test_contracts.py`
+@pytest.mark.parametrize("name", CASES)
 def test_exact_draws_stay_exact_and_much_is_new(name):
     """The mean change of every moment is zero, within four standard errors."""
     (filter, backward), before = CASES[name], exact_trajectories("two modes")
