@@ -188,7 +188,7 @@ class SelectInitial(AbstractMove):
             return (jax.random.fold_in(key, 2), again), None
 
         start = (key, jax.tree.map(jnp.zeros_like, particles))
-        (_, again), _ = jax.lax.scan(add, start, jnp.arange(num_rounds))
+        (_, again), _ = jax.lax.scan(add, start, jnp.arange(num_rounds, dtype=jnp.int32))
         derive = lambda leaf, source: (  # noqa: E731
             add_gradient(leaf, source) if eqx.is_inexact_array(leaf) else leaf
         )
