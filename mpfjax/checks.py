@@ -251,6 +251,7 @@ Exponent = Annotated[float, number(lambda x: 0 < x <= 1, "a number in (0, 1]")]
 POSITIVE = entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite throughout")
 NOT_NEGATIVE = entries(lambda array: (array >= 0) & np.isfinite(array), "finite and not negative")
 FINITE = entries(np.isfinite, "finite throughout")
+SHARES = entries(lambda array: (array >= 0) & (array <= 1), "in [0, 1] throughout")
 COVARIANCE = entries(_is_covariance, "a covariance, symmetric without a negative eigenvalue")
 
 
@@ -389,6 +390,7 @@ def saying(what: str) -> Iterator[None]:
 
 
 def shown(value: Any) -> str:
-    """The value as it is printed, cut where it is long."""
-    text = str(value) if isinstance(value, jax.Array | np.ndarray) else repr(value)
+    """The value on one line, cut where it is long; arrays of ten numbers or more as shapes."""
+    is_short = isinstance(value, jax.Array | np.ndarray) and value.size < 10
+    text = " ".join((str(value) if is_short else eqx.tree_pformat(value, width=_MOST)).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."

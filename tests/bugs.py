@@ -278,8 +278,8 @@ BUGS = {
     ),
     "PaRIS leaves sums where they were": Bug(
         "smoothing/sums.py",
-        "kept = jax.tree.map(of_pasts, kept)",
-        "kept = kept",
+        "return jax.tree.map(of_pasts, terms), values",
+        "return terms, values",
         "tests/smoothing/test_contracts.py -m 'not exactness' -k PaRIS",
     ),
     "a fixed lag keeps the term that is overwritten": Bug(

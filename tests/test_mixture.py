@@ -48,6 +48,23 @@ def test_what_is_derived_is_what_numpy_gives(mixture):
         np.testing.assert_allclose(covariances[m], covariance, rtol=1e-3, atol=1e-4)
 
 
+@over_mixtures
+def test_quantiles_are_those_of_the_weighted_distribution_function(mixture):
+    """Of each coordinate, under jit, and of a stack under vmap."""
+    log_weights, states = np.asarray(mixture.log_weights, float), np.asarray(mixture.particles)
+    shares = jnp.array([0.0, 0.05, 0.31, 0.5, 0.95, 1.0])
+    found = jax.jit(lambda mixture: mixture.quantile(mixture.particles, shares))(mixture)
+    for d in range(states.shape[1]):
+        order = np.argsort(states[:, d])
+        order = order[np.isfinite(log_weights[order])]
+        below = np.cumsum(np.exp(log_weights[order]))
+        place = np.searchsorted(below, np.asarray(shares) * below[-1] * (1 - 1e-6))
+        np.testing.assert_array_equal(found[:, d], states[order, d][place])
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), mixture)
+    median = jax.vmap(lambda mixture: mixture.quantile(lambda states: states[:, 0], 0.5))(stack)
+    np.testing.assert_array_equal(median, jnp.full(3, found[3, 0]))
+
+
 def test_flattening_puts_all_leaves_side_by_side():
     leaves = {"a": jnp.arange(3), "b": jnp.ones((3, 2, 2)), "c": jnp.zeros((3, 1))}
     flat = flatten_states(leaves)

@@ -187,6 +187,14 @@ def _simulate(key, model, num_steps, inputs):
     key_initial, key_steps = jax.random.split(key)
     initial = model.sample_initial(key_initial, 1)
     check_states(initial, model, "sample_initial", 1)
+    states, observations = steps_ahead(key_steps, model, initial, num_steps, inputs)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), initial, states), observations
+
+
+def steps_ahead(
+    key: Key[Array, ""], model: Any, state: PyTree, num_steps: int, inputs: PyTree
+) -> tuple[PyTree, PyTree]:
+    """Draw the next states and observations from a state, leaves (1, ...): (k, ...) of each."""
 
     def advance(state: PyTree, step: tuple[Array, PyTree]) -> tuple[PyTree, tuple[PyTree, PyTree]]:
         step_key, now = step
@@ -196,12 +204,6 @@ def _simulate(key, model, num_steps, inputs):
         check_moved(moved, state, model)
         seen = at_step.sample_observation(key_observation, moved)
         check_states(seen, model, "sample_observation", 1)
-        return moved, (moved, seen)
+        return moved, jax.tree.map(lambda leaf: leaf[0], (moved, seen))
 
-    steps = (jax.random.split(key_steps, num_steps), inputs)
-    _, (states, observations) = jax.lax.scan(advance, initial, steps)
-    first = lambda leaf: leaf[:, 0]  # noqa: E731
-    states = jax.tree.map(
-        lambda start, later: first(jnp.concatenate([start[None], later])), initial, states
-    )
-    return states, jax.tree.map(first, observations)
+    return jax.lax.scan(advance, state, (jax.random.split(key, num_steps), inputs))[1]

@@ -17,12 +17,15 @@ from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 
 class Forecast(eqx.Module):
-    """The predictive distribution of a filter for the next k steps.
+    """The predictive distribution of a filter for the next k steps, as weighted draws.
 
     - `mixtures`: the mixtures at t + 1, ..., t + k, stacked: components keep their labels as far as
       the filter's regrouping allows. `jax.vmap` maps derived quantities over them.
-    - `observations`: one simulated observation for each particle, leaves (k, n, ...), with the
-      weights of the particles; None where none were asked for.
+    - `observations`: one simulated observation for each particle, leaves (k, n, ...), which counts
+      by the weight of its particle; None where none were asked for.
+
+    The draws are weighted, so take intervals by `ParticleMixture.quantile` and not `jnp.quantile`:
+    `jax.vmap(lambda mixture, y: mixture.quantile(y, [0.05, 0.95]))(mixtures, observations)`.
     """
 
     mixtures: ParticleMixture
@@ -45,7 +48,7 @@ def forecast(
     masses, so that a component's mixture weight is the probability of its mode.
 
     - `simulate_observation(key, states)`: draws y given each of the n states, leaves (n, ...), as
-      the model's likelihood would have it; for intervals of what will be observed. If the model is
+      the model's likelihood would have it, for intervals of what will be observed. If the model is
       wrapped by `per_particle`, it draws y given one state, and gets a key for each.
     - `inputs`: u_{t+1}, ..., u_{t+k}, the known inputs of the steps to come, as for `run_filter`. A
       method of the model, given as `simulate_observation`, sees them too.

@@ -1,23 +1,26 @@
 """Online smoothing of sums over a trajectory: PaRIS, and fixed-lag smoothing."""
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array, Int, Key, PyTree
 
-from mpfjax.chain import check_keep_parents
-from mpfjax.checks import Count, CountOrZero, check_one_each, checked, saying
+from mpfjax.chain import StepInfo, check_keep_parents
+from mpfjax.checks import Checked, Count, CountOrZero, check_one_each, checked, saying
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require, with_inputs
 from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.models.observations import as_series
-from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
+from mpfjax.models.observations import as_series, one_input, one_observation
+from mpfjax.operations.compiling import (
+    jit_on_wide_vectors,
+    jit_with_floats_traced,
+    with_floats_traced,
+)
 from mpfjax.operations.logarithms import as_inexact
 from mpfjax.operations.random import split, split_keys
 from mpfjax.operations.stored import take
@@ -84,57 +87,30 @@ def smoothed_sums(
     series too long to keep. `sample_trajectories` needs the mixtures of all steps, and serves every
     function at once.
     """
-    refuse_marginalised(filter.model, "smoothed_sums", "take sample_trajectories")
-    require(filter.model, "log_transition", "smoothed_sums")
-    if method == "mcmc":
-        check_keep_parents("filter", filter.moves, "smoothed_sums with method 'mcmc'")
     series = as_series(observations, filter.model)
     if lag is not None:
         lag = min(lag, series.length - 1)
-    options = (mapped(filter.model, function), lag, method, num_draws)
-    sums = with_floats_traced(lambda filter: _smooth(key, filter, series, options), filter)
+    smoother = FixedLagSmoother(filter, function, lag or 0, method, num_draws)
+    smooth = lambda smoother: _smooth(key, smoother, series, lag)  # noqa: E731
+    sums = with_floats_traced(smooth, smoother)
     return SmoothedSums(sums.sums, sums.terms, sound(sums.run))
 
 
 @jit_on_wide_vectors
-def _smooth(key, filter, series, options):
-    function, lag, method, num_draws = options
+def _smooth(key, smoother, series, lag):
     # The first two are those of `run_filter`.
     key_initial, key_steps, key_backward = split_keys(key, 3)
-    length = series.length
+    length, filter, num_kept = series.length, smoother.filter, smoother.lag + 1
     step_keys = jax.random.split(key_steps, length)
     initial = first_mixture(key_initial, filter, series)
-    num_kept = 1 if lag is None else lag + 1
-    states = initial.particles
-    shapes = jax.eval_shape(partial(_of_states, function), states, states)
-    kept = jax.tree.map(lambda leaf: jnp.zeros((num_kept, *leaf.shape), leaf.dtype), shapes)
-    settled = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), shapes)
+    kept = smoother._no_terms(initial.particles)
+    settled = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[2:], leaf.dtype), kept)
 
     def advance(carry: tuple[ParticleMixture, PyTree, PyTree], step: PyTree) -> Any:
         mixture, kept, settled = carry
         t, step_key, draw_key, now = step
         moved, info = step_or_predict(filter, step_key, mixture, now)
-        model = with_inputs(filter.model, now.inputs)
-        needed, start = moved.occupied, moved.ancestor_indices
-        if method == "exact":
-            log_density = log_transition_from(model, mixture)
-            futures = moved.particles
-            indices = draw_exactly(draw_key, log_density, futures, mixture, num_draws, needed)
-        else:
-            key_proposed, key_walk = split(draw_key, 2)
-            # The start counts as a draw, unless it would be the only one.
-            shape = (max(num_draws - 1, 1), start.shape[0])
-            proposed = draw(key_proposed, shape, mixture.log_weights)
-            later = walk(key_walk, model, moved.particles, mixture, start, proposed, needed).T
-            both = [start[:, None], later]
-            indices = later if num_draws == 1 else jnp.concatenate(both, axis=1)
-        places = indices.reshape(-1)
-        earlier = jax.tree.map(lambda leaf: take(leaf, places), mixture.particles)
-        repeat = lambda leaf: jnp.repeat(leaf, num_draws, axis=0)  # noqa: E731
-        values = _of_states(function, earlier, jax.tree.map(repeat, moved.particles))
-        values = jax.tree.map(lambda leaf: _mean_of_pasts(leaf, num_draws), values)
-        of_pasts = jax.vmap(lambda rows: _mean_of_pasts(take(rows, places), num_draws))
-        kept = jax.tree.map(of_pasts, kept)
+        kept, values = smoother._of_pasts(draw_key, now.inputs, mixture, moved, kept)
         if lag is None:
             kept = jax.tree.map(lambda old, new: old + new[None], kept, values)
         else:
@@ -162,16 +138,137 @@ def _smooth(key, filter, series, options):
     return SmoothedSums(sums, terms, run_of(initial, final, None, reports))
 
 
+class Window(NamedTuple):
+    """All that a fixed-lag smoother goes on from."""
+
+    mixture: ParticleMixture
+    """the filter's, at t."""
+    terms: PyTree
+    """E[h(x_{r-1}, x_r) | x_t, y_1..y_t] of each particle, for r of the last L + 1 steps: leaves
+    (L + 1, n, ...), term r in row (r - 1) mod (L + 1)."""
+    num_steps: Int[Array, ""]
+    """t, from the start on."""
+
+
+class FixedLagSmoother(Checked):
+    """E[h(x_{r-1}, x_r) | y_1..y_t] for r = t - L, ..., t, as each observation comes in.
+
+    `smoothed_sums` one step at a time (PaRIS: Olsson and Westerborn 2017), with the filter in it.
+    Memory is that of h for L + 1 mixtures, whatever t is. Shapes are fixed, so that `step` compiles
+    once and works within `jax.jit` and `jax.lax.scan`.
+
+    - `filter`: one whose model has `log_transition`.
+    - `function`: h of x_{t-1} and x_t of n particles, as for `smoothed_sums`;
+      `lambda before, now: now` estimates the states themselves, an event its probability.
+    - `lag`: L. The longer, the less is lost of what later observations say. More than the dynamics
+      remember brings nothing but noise.
+    - `method`, `num_draws`: as for `smoothed_sums`; "mcmc" costs O(N) a step, "exact" O(N²).
+
+    Raises `ValueError` as `smoothed_sums` does. Use it for estimates that may come a little late,
+    as of a place on a map; `smoothed_sums` is for a series that is there as a whole.
+    """
+
+    filter: Filter
+    function: Callable[[PyTree, PyTree], PyTree]
+    lag: CountOrZero = eqx.field(static=True)
+    method: Literal["exact", "mcmc"] = eqx.field(static=True, default="exact")
+    num_draws: Count = eqx.field(static=True, default=2)
+
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        user = "FixedLagSmoother or smoothed_sums"
+        refuse_marginalised(self.filter.model, user, "take sample_trajectories")
+        require(self.filter.model, "log_transition", user)
+        if self.method == "mcmc":
+            check_keep_parents("filter", self.filter.moves, f"{user} with method 'mcmc'")
+
+    def init(self, mixture: ParticleMixture) -> Window:
+        """The window to start from: at the mixture of `Filter.init`, or at any later one."""
+        return Window(mixture, self._no_terms(mixture.particles), jnp.zeros((), jnp.int32))
+
+    def step(
+        self,
+        key: Key[Array, ""],
+        window: Window,
+        observation: PyTree = None,
+        *,
+        inputs: PyTree = None,
+    ) -> tuple[Window, PyTree, StepInfo]:
+        """The next window, the estimates of r = t - L, ..., t, and the filter's report.
+
+        Estimates have leaves (L + 1, ...): the first is final, the last is the filter's own. They
+        are NaN for r < 1, where there is no term yet. `observation` is y_t, None where it is
+        missing; `inputs` are u_t.
+        """
+        key_step, key_draws = jax.random.split(key)
+        seen = None if observation is None else one_observation(observation)
+        moved, info = self.filter._run(key_step, window.mixture, seen, inputs)
+        inputs = one_input(inputs, self.filter.model)
+        return *_advanced(self, key_draws, window, moved, inputs), info
+
+    def _no_terms(self, states: PyTree) -> PyTree:
+        """Zeros for the terms of the first steps, of which there are none: (L + 1, n, ...)."""
+        shapes = jax.eval_shape(self._of_states, states, states)
+        zeros = lambda leaf: jnp.zeros((self.lag + 1, *leaf.shape), leaf.dtype)  # noqa: E731
+        return jax.tree.map(zeros, shapes)
+
+    def _of_pasts(
+        self,
+        key: Key[Array, ""],
+        inputs: PyTree,
+        mixture: ParticleMixture,
+        moved: ParticleMixture,
+        terms: PyTree,
+    ) -> tuple[PyTree, PyTree]:
+        """Terms of the particles at t - 1 as means over the pasts of those at t; and h of the step.
+
+        Leaves of the first are (any, n, ...) as they were, of the second (n, ...).
+        """
+        model, num_draws = with_inputs(self.filter.model, inputs), self.num_draws
+        needed, start = moved.occupied, moved.ancestor_indices
+        if self.method == "exact":
+            log_density = log_transition_from(model, mixture)
+            futures = moved.particles
+            indices = draw_exactly(key, log_density, futures, mixture, num_draws, needed)
+        else:
+            key_proposed, key_walk = split(key, 2)
+            # The start counts as a draw, unless it would be the only one.
+            shape = (max(num_draws - 1, 1), start.shape[0])
+            proposed = draw(key_proposed, shape, mixture.log_weights)
+            later = walk(key_walk, model, moved.particles, mixture, start, proposed, needed).T
+            both = [start[:, None], later]
+            indices = later if num_draws == 1 else jnp.concatenate(both, axis=1)
+        places = indices.reshape(-1)
+        earlier = jax.tree.map(lambda leaf: take(leaf, places), mixture.particles)
+        repeat = lambda leaf: jnp.repeat(leaf, num_draws, axis=0)  # noqa: E731
+        values = self._of_states(earlier, jax.tree.map(repeat, moved.particles))
+        values = jax.tree.map(lambda leaf: _mean_of_pasts(leaf, num_draws), values)
+        of_pasts = jax.vmap(lambda rows: _mean_of_pasts(take(rows, places), num_draws))
+        return jax.tree.map(of_pasts, terms), values
+
+    def _of_states(self, previous: PyTree, states: PyTree) -> PyTree:
+        """h of these states; a `ValueError` unless it is one value a particle."""
+        with saying("in function, which is called with x_{t-1} and x_t of all particles"):
+            values = mapped(self.filter.model, self.function)(previous, states)
+        check_one_each(jax.tree.leaves(states)[0].shape[0], function=values)
+        return jax.tree.map(as_inexact, values)
+
+
 def _mean_of_pasts(values: Array, num_draws: int) -> Array:
     """For each particle the mean of its draws, which stand side by side."""
     return jnp.mean(values.reshape(-1, num_draws, *values.shape[1:]), axis=1)
 
 
-def _of_states(
-    function: Callable[[PyTree, PyTree], PyTree], previous: PyTree, states: PyTree
-) -> PyTree:
-    """h of these states; a `ValueError` unless it is one value a particle."""
-    with saying("in function, which is called with x_{t-1} and x_t of all particles"):
-        values = function(previous, states)
-    check_one_each(jax.tree.leaves(states)[0].shape[0], function=values)
-    return jax.tree.map(as_inexact, values)
+@jit_with_floats_traced
+def _advanced(smoother: Any, key: Any, window: Window, moved: ParticleMixture, inputs: PyTree):
+    """The next window, and the estimates."""
+    terms, values = smoother._of_pasts(key, inputs, window.mixture, moved, window.terms)
+    t, num_kept = window.num_steps, smoother.lag + 1
+    terms = jax.tree.map(lambda old, new: old.at[t % num_kept].set(new), terms, values)
+    steps = t - smoother.lag + jnp.arange(num_kept, dtype=t.dtype)
+
+    def estimates(leaf: Array) -> Array:
+        average = lambda r: jnp.where(r < 0, jnp.nan, moved.average(leaf[r % num_kept]))  # noqa: E731
+        return jax.vmap(average)(steps)
+
+    return Window(moved, terms, t + 1), jax.tree.map(estimates, terms)

@@ -8,6 +8,7 @@ from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
 from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
 from mpfjax.tuning.optimisation import fit as fit
 from mpfjax.tuning.optimisation import maximise as maximise
+from mpfjax.tuning.predictive import posterior_predictive as posterior_predictive
 from mpfjax.tuning.sequential import smc2 as smc2
 from mpfjax.tuning.transforms import Interval as Interval
 from mpfjax.tuning.transforms import Positive as Positive

@@ -123,7 +123,7 @@ class Sampling(Checked):
         num_invalid = jax.tree.map(np.asarray, state.carry.num_invalid)
         warn_of_invalid(self.caller, num_invalid, stacklevel=5)
         factor = np.asarray(state.carry.walk.factor)
-        fields = {"num_invalid": num_invalid, "stopped": stopped}
+        fields = {"num_invalid": num_invalid, "stopped": stopped, "problem": self.problem}
         return draws, fields | {"proposal_covariance": factor @ factor.T}
 
     def _starts(self, key: Key[Array, ""]) -> Reals:

@@ -1,5 +1,6 @@
 """The log density of parameters in unconstrained numbers, for samplers: our own and others'."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
@@ -44,6 +45,8 @@ class Point(eqx.Module):
     """-inf where it is zero, no number, or where the prior is zero."""
     mixture: Any = None
     """where their filter stands, for samplers that go on with it."""
+    key_data: Any = None
+    """of the key of their filter's run, for what makes it again."""
 
     @property
     def log_density(self) -> Float[Array, "*n"]:
@@ -83,7 +86,8 @@ class LogDensity(eqx.Module):
         self, key: Key[Array, ""], reals: Reals
     ) -> tuple[Point, dict[str, Bool[Array, ""]]]:
         """Its two parts, and which of them are no numbers."""
-        return evaluated(reals, self.prior(reals), self.problem.value(reals, key))
+        point, invalid = evaluated(reals, self.prior(reals), self.problem.value(reals, key))
+        return dataclasses.replace(point, key_data=jax.random.key_data(key)), invalid
 
     @property
     def start(self) -> Reals:

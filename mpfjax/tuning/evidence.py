@@ -14,7 +14,7 @@ from mpfjax.filter import Filter
 from mpfjax.models.observations import Series, as_series, gathered
 from mpfjax.moves.base import AbstractMove
 from mpfjax.proposals import AbstractProposal
-from mpfjax.running.scan import scan
+from mpfjax.running.scan import FilterRun, scan
 from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, placed, pose
 
 UnbiasedFilter = Annotated[
@@ -33,13 +33,17 @@ class LogEvidence(eqx.Module):
     """sequences of one shape, stacked."""
 
     def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, ""]:
-        """One run for each sequence."""
-        total = 0.0
-        for g, group in enumerate(self.groups):
-            keys = jax.random.split(jax.random.fold_in(key, g), group.length)
-            run = lambda key, series: scan(key, filter, series, lambda mixture: None)  # noqa: E731
-            total += jnp.sum(jax.vmap(run)(keys, group).log_marginal_likelihood)
-        return jnp.asarray(total)
+        """The sum over one run for each sequence."""
+        runs = self.runs(key, filter)
+        return jnp.asarray(sum(jnp.sum(run.log_marginal_likelihood) for run in runs))
+
+    def runs(self, key: Key[Array, ""], filter: Filter) -> list[FilterRun]:
+        """The runs of each group, with nothing collected."""
+        run = lambda key, series: scan(key, filter, series, lambda mixture: None)  # noqa: E731
+        return [
+            jax.vmap(run)(jax.random.split(jax.random.fold_in(key, g), group.length), group)
+            for g, group in enumerate(self.groups)
+        ]
 
 
 def pose_evidence(

@@ -62,6 +62,8 @@ class GibbsPosterior:
     numbers of `draw`, or densities in the `conditional_filter` were NaN or +inf."""
     proposal_covariance: Float[np.ndarray, "d d"] | None = None
     """of the random walk after burn-in, in unconstrained numbers, in the order of their names."""
+    problem: Problem | None = field(default=None, repr=False, compare=False)
+    """what was sampled: the filter, its parameters and the observations."""
 
     @property
     def acceptance_rate(self) -> float:

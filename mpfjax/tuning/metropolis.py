@@ -12,7 +12,7 @@ from mpfjax.checks import Count, checked
 from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Sampling, Step
 from mpfjax.tuning.densities import LogDensity, LogPrior, Point, checked_prior
 from mpfjax.tuning.evidence import UnbiasedFilter, pose_evidence
-from mpfjax.tuning.problem import Parameters, Reals, Transforms
+from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms
 from mpfjax.tuning.walks import RandomWalk, checked_deviations, metropolis_step
 
 
@@ -33,6 +33,10 @@ class Posterior:
     +inf, in all its steps."""
     proposal_covariance: Float[np.ndarray, "d d"] | None = None
     """of the random walk after burn-in, in unconstrained numbers, in the order of their names."""
+    key_data: Any = field(default=None, repr=False)
+    """of the key with which the filter ran for each log Ẑ."""
+    problem: Problem | None = field(default=None, repr=False, compare=False)
+    """what was sampled: the filter, its parameters and the observations."""
 
     @property
     def acceptance_rate(self) -> float:
@@ -108,8 +112,8 @@ def metropolis_hastings(
     density = LogDensity(problem, prior)
     data = {"observations": problem.objective}
     functions = {"log_prior": (prior, problem.start())}
-    (reals, log_evidence, accepted), fields = sampling.run(_Kernel(density), data, functions)
-    return Posterior(problem.constrained_rows(reals), log_evidence, accepted, **fields)
+    rows, fields = sampling.run(_Kernel(density), data, functions)
+    return Posterior(problem.constrained_rows(rows[0]), *rows[1:3], key_data=rows[3], **fields)
 
 
 class _Kernel(AbstractKernel):
@@ -129,5 +133,5 @@ class _Kernel(AbstractKernel):
         """A Gaussian step in u with a fresh key, accepted or not."""
         evaluate = self.density.evaluated
         point, accepted, invalid = metropolis_step(key, walk.factor, state, evaluate)
-        report = (point.reals, point.log_likelihood, accepted)
+        report = (point.reals, point.log_likelihood, accepted, point.key_data)
         return Step(point, report, accepted.astype(point.log_prior.dtype), invalid)

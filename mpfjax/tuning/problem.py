@@ -106,9 +106,13 @@ class Problem(eqx.Module):
 
     def at(self, reals: Reals) -> Any:
         """The filter or model with these parameters."""
+        return self.having(self.constrain(reals))
+
+    def having(self, values: Mapping[str, Any]) -> Any:
+        """The same with parameters on their own scale."""
         leaves = list(self.leaves)
         for name, index in self.tuned:
-            leaves[index] = self.transforms[name].constrain(reals[name])
+            leaves[index] = values[name]
         return jax.tree.unflatten(self.structure, leaves)
 
     def value(self, reals: Reals, key: Key[Array, ""]) -> Float[Array, ""]:

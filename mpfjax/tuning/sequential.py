@@ -23,7 +23,7 @@ from mpfjax.tuning.parameter_particles import (
     rejuvenated,
     started,
 )
-from mpfjax.tuning.problem import Parameters, Transforms, pose
+from mpfjax.tuning.problem import Parameters, Problem, Transforms, pose
 
 # The share of their number below which the effective sample size of the θs leads to moves.
 _ESS_THRESHOLD = 0.5
@@ -52,6 +52,10 @@ class SequentialPosterior:
     and of proposals that were rejected."""
     stopped: str | None = None
     """why it ended before the last observation, or None."""
+    problem: Problem | None = field(default=None, repr=False, compare=False)
+    """what was sampled: the filter, its parameters and the observations."""
+    mixtures: Any = field(default=None, repr=False, compare=False)
+    """of each sample's own filter, after the last observation."""
     _goes_on: "tuple[_Run, State] | None" = field(default=None, repr=False, compare=False)
     """what `extend` starts from."""
 
@@ -68,6 +72,17 @@ class SequentialPosterior:
     def mean(self, name: str) -> np.ndarray:
         """E[θ | y_1..y_t] of one parameter, estimated."""
         return np.asarray(np.einsum("n,n...->...", self.weights, self.parameters[name]))
+
+    def resampled(self, rows: PyTree) -> PyTree:
+        """The rows of as many samples of equal weight (systematic), as of one chain: (1, n, ...).
+
+        Their order is without meaning: in their own, copies would look like a chain that sticks.
+        """
+        num, cumulative = len(self.weights), np.cumsum(self.weights, dtype=float)
+        quantiles = (np.arange(num) + 0.5) / num * cumulative[-1]
+        draws = np.minimum(np.searchsorted(cumulative, quantiles, side="right"), num - 1)
+        draws = np.random.default_rng(0).permutation(draws)
+        return jax.tree.map(lambda leaf: leaf[draws][None], rows)
 
     def extend(self, observations: PyTree, *, progress: bool = True) -> "SequentialPosterior":
         """The posterior after further observations: the one of all observations at once.
@@ -137,9 +152,11 @@ def smc2(
     for posteriors with several modes, and to compare models; `metropolis_hastings` is simpler where
     only the last posterior is wanted.
     """
-    if num_samples % (num_moves + 1):
+    size = num_moves + 1
+    if num_samples % size:
+        low = max(num_samples - num_samples % size, size)
         raise ValueError(
-            f"num_samples: {num_samples} is no multiple of num_moves + 1, {num_moves + 1}"
+            f"num_samples: {num_samples} is no multiple of num_moves + 1: {low} or {low + size}"
         )
     series = jax.tree.map(np.asarray, one_sequence(observations, filter.model))
     runs = _padded(series, series.length)
@@ -226,6 +243,8 @@ class _Run:
             *state.rows,
             num_invalid=num_invalid,
             stopped=stopped,
+            problem=self.sampler.problem,
+            mixtures=samples.particles.mixture,
             _goes_on=(self, state),
         )
 

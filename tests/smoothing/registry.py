@@ -13,7 +13,13 @@ import numpy as np
 
 import mpfjax
 from mpfjax import Series
-from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_sums, trace_ancestors
+from mpfjax.smoothing import (
+    FixedLagSmoother,
+    conditional_filter,
+    sample_trajectories,
+    smoothed_sums,
+    trace_ancestors,
+)
 from tests.registry import CHAINS
 
 NUM_TRAJECTORIES, LAG = 4, 2
@@ -65,6 +71,22 @@ def _online(**options):
     return smooth
 
 
+def _stepwise(key, filter, observations, inputs=None):
+    """The terms at t - L, and after the last step those that are left; NaN is missing."""
+    smoother = FixedLagSmoother(filter, statistics_for(filter.model), LAG, "mcmc", 3)
+    key, key_start = jax.random.split(key)
+    window, rows, increments = smoother.init(filter.init(key_start)), [], []
+    observations = np.asarray(observations)
+    for t, own in enumerate(jax.random.split(key, len(observations))):
+        seen = None if np.isnan(observations[t]).all() else observations[t]
+        given = None if inputs is None else inputs[t]
+        window, found, info = smoother.step(own, window, seen, inputs=given)
+        rows += [found[0]] * (t >= LAG)
+        increments.append(info.log_likelihood_increment)
+    left = found[-min(LAG, len(observations)) :]
+    return jnp.stack(increments), jnp.stack([*rows, *left])
+
+
 def _conditional(key, filter, observations, trajectory, inputs=None):
     series = Series.skipping(observations, inputs)
     found = conditional_filter(key, filter, series, trajectory).trajectory
@@ -98,6 +120,7 @@ SMOOTHERS = {
     "PaRIS, MCMC": Smoother(online=_online(method="mcmc", num_draws=3), summed=True),
     "fixed lag": Smoother(online=_online(lag=LAG), lag=LAG),
     "fixed lag, MCMC": Smoother(online=_online(lag=LAG, method="mcmc", num_draws=3), lag=LAG),
+    "fixed lag, step by step": Smoother(online=_stepwise, lag=LAG),
     "conditional filter": Smoother(kernel=_conditional),
 }
 
@@ -152,5 +175,6 @@ CASES = [
 QUICK_CASES = [
     *((name, "pf", "four dimensions") for name in SMOOTHERS if SMOOTHERS[name].of_run),
     ("PaRIS", "mpf", "two modes"),
+    ("fixed lag, step by step", "mpf", "one dimension"),
     ("conditional filter", "mpf", "one dimension"),
 ]  # fmt: skip

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import mpfjax
 from mpfjax import forecast
@@ -64,3 +65,23 @@ def test_a_wrapped_models_observations_are_drawn_one_by_one():
     noise = ahead.observations - ahead.mixtures.particles[..., 0]
     assert noise.shape == (2, 400)
     np.testing.assert_allclose(noise.std(axis=1), 1.0, atol=4 / np.sqrt(2 * 400))
+
+
+def test_intervals_are_the_kalman_filters():
+    """Of states and observations, where weights are far from equal after a surprising y_t."""
+    seen = SEEN.at[-1].set(1.5)
+    filter = mpfjax.mixture_particle_filter(LINEAR, 20_000, 3)
+    run = mpfjax.run_filter(jax.random.key(1), filter, seen, lambda mixture: None)
+    ahead = forecast(jax.random.key(2), filter, run.final, NUM_STEPS, simulate_observation=observe)
+    interval = jax.vmap(lambda mixture, values: mixture.quantile(values, [0.05, 0.95]))
+    states = ahead.mixtures.particles
+    found = interval(ahead.mixtures, jnp.concatenate([states, ahead.observations], axis=2))
+    unknown = jnp.concatenate([seen, jnp.full((NUM_STEPS, 1), jnp.nan)])
+    exact = kalman_filter(LINEAR, unknown, missing="skip")
+    means, variances = exact.means[-NUM_STEPS:, 0], exact.covariances[-NUM_STEPS:, 0, 0]
+    error = np.sqrt(0.05 * 0.95 / run.final.effective_sample_size)
+    for kind, spread in enumerate((variances, variances + 0.4)):
+        shares = norm.cdf(found[:, :, kind], means[:, None], np.sqrt(spread)[:, None])
+        np.testing.assert_allclose(shares, [[0.05, 0.95]] * NUM_STEPS, atol=4 * error)
+    # Without the weights it is another.
+    assert jnp.quantile(states[0], 0.05) < found[0, 0, 0] - 0.3

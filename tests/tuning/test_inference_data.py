@@ -10,6 +10,7 @@ import pytest
 from mpfjax.tuning import to_inference_data
 from mpfjax.tuning.gibbs import GibbsPosterior
 from mpfjax.tuning.metropolis import Posterior
+from mpfjax.tuning.predictive import Predictive
 from mpfjax.tuning.sequential import SequentialPosterior
 
 RNG = np.random.default_rng(0)
@@ -18,8 +19,8 @@ STATES = {"position": RNG.normal(size=(3, 50, 6, 2)), "speed": RNG.normal(size=(
 ACCEPTED, RENEWED = RNG.random((3, 50)), RNG.random((3, 50, 6)) < 0.7
 
 
-def before_1(posterior=None, *, sample_stats=None, dims=None, coords=None):
-    return {"posterior": posterior, "sample_stats": sample_stats}, dims, coords
+def before_1(posterior=None, *, dims=None, coords=None, **groups):
+    return {"posterior": posterior} | groups, dims, coords
 
 
 def from_1_on(data, *, dims=None, coords=None):
@@ -51,6 +52,17 @@ def test_of_particle_gibbs():
     groups, dims, _ = to_inference_data(first)
     assert groups["posterior"]["state"].shape == (3, 50)
     assert set(dims) == {"renewed"}
+
+
+def test_of_what_comes_next():
+    ahead = Predictive({"speed": RNG.normal(size=(3, 50, 4))}, RNG.normal(size=(3, 50, 4, 2)))
+    result = GibbsPosterior(PARAMETERS, STATES, ACCEPTED, RENEWED)
+    groups, dims, coords = to_inference_data(result, ahead)
+    assert set(groups["posterior_predictive"]) == {"observation", "state_ahead_speed"}
+    assert dims["observation"] == ["ahead", "observation_dim_1"]
+    assert dims["state_ahead_speed"] == ["ahead"]
+    np.testing.assert_array_equal(coords["ahead"], [1, 2, 3, 4])
+    np.testing.assert_array_equal(coords["time"], np.arange(6))
 
 
 def test_of_smc2_samples_count_as_often_as_they_weigh():

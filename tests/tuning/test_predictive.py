@@ -1,0 +1,103 @@
+"""What comes next over the posterior of parameters and states, against the exact distribution."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.scipy.stats import norm
+
+import mpfjax
+from mpfjax import Series
+from mpfjax.exact import kalman_filter
+from mpfjax.tuning import metropolis_hastings, particle_gibbs, posterior_predictive, smc2
+from tests.marking import exactness
+from tests.tuning.exact_posteriors import Pushed
+
+KEY, NUM_STEPS = jax.random.key(0), 3
+SEEN = np.float32([1.5, 2.2, np.nan, 4.1, np.nan, np.nan, np.nan])
+INPUTS = np.float32([0.4, -0.2, 0.7, 0.1, 0.5, -1.0, 0.3])
+SERIES = Series.skipping(SEEN[:-NUM_STEPS], INPUTS[:-NUM_STEPS])
+
+
+class Drifting(Pushed):
+    """x_t = a x_{t-1} + u_t + d + N(0, q²) with d ~ N(0, 1): all is normal, d included."""
+
+    d: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
+
+    def transition_mean(self, states):
+        return super().transition_mean(states) + self.d
+
+    def sample_observation(self, key, states):
+        return self.h * states + self.r * jax.random.normal(key, states.shape)
+
+
+FILTER = mpfjax.particle_filter(Drifting(), 5)
+OF_D = {"parameters": {"d": lambda filter: filter.model.d}, "progress": False}
+CHAINS = {"num_chains": 100, "burn_in": 30} | OF_D
+
+
+@cache
+def exact_moments():
+    """Of x and y after the last observation, by a Kalman filter of the state (x, d)."""
+    m = jax.tree.map(float, Drifting())
+    model = mpfjax.LinearGaussianModel(
+        A=[[m.a, 1.0], [0.0, 1.0]], Q=np.diag([m.q**2, 0.0]), B=[[1.0], [0.0]],
+        H=[[m.h, 0.0]], R=[[m.r**2]], m0=[m.m, 0.0], P0=np.diag([m.p**2, 1.0]),
+    )  # fmt: skip
+    found = kalman_filter(model, SEEN[:, None], inputs=INPUTS[:, None], missing="skip")
+    mean, variance = np.asarray(found.means)[:, 0], np.asarray(found.covariances)[:, 0, 0]
+    mean, variance = mean[-NUM_STEPS:], variance[-NUM_STEPS:]
+    return [(mean, variance), (m.h * mean, m.h**2 * variance + m.r**2)]
+
+
+def log_prior(parameters):
+    return norm.logpdf(parameters["d"])
+
+
+def sample_prior(key):
+    return {"d": jax.random.normal(key)}
+
+
+def draw(key, trajectory, observations, model):
+    """d given the trajectory, by the steps' residuals."""
+    rest = trajectory[1:] - model.a * trajectory[:-1] - SERIES.inputs
+    precision = 1 + len(rest) / model.q**2
+    mean = jnp.sum(rest) / model.q**2 / precision
+    return {"d": mean + jax.random.normal(key) / jnp.sqrt(precision)}
+
+
+def by_metropolis():
+    options = {"log_prior": log_prior, "sample_prior": sample_prior, "proposal_deviations": 0.8}
+    run = metropolis_hastings(KEY, FILTER, SERIES, 200, **options, **CHAINS)
+    own = jax.random.wrap_key_data(run.key_data[3, 7])
+    again = run.problem.objective(own, run.problem.having({"d": run.parameters["d"][3, 7]}))
+    assert float(again) == pytest.approx(run.log_marginal_likelihoods[3, 7], abs=1e-4)
+    return run
+
+
+def by_gibbs():
+    return particle_gibbs(KEY, FILTER, SERIES, 200, draw=draw, **CHAINS)
+
+
+def by_smc2():
+    options = {"log_prior": log_prior, "sample_prior": sample_prior, "num_moves": 3}
+    return smc2(KEY, FILTER, SERIES, 4000, **options, **OF_D)
+
+
+@pytest.mark.parametrize("sample", [by_metropolis, *exactness([by_gibbs, by_smc2])])
+def test_means_and_variances_are_the_exact_ones(sample):
+    """Within four standard errors, over chains; of `smc2`, by its effective sample size."""
+    run = sample()
+    found = posterior_predictive(jax.random.key(1), run, NUM_STEPS, inputs=INPUTS[-NUM_STEPS:])
+    for values, (mean, variance) in zip(found, exact_moments(), strict=True):
+        moments = np.stack([values - mean, (values - mean) ** 2 - variance])
+        if sample is by_smc2:
+            error = moments.std(axis=2) / np.sqrt(run.effective_sample_sizes.min())
+        else:
+            error = moments.mean(axis=2).std(axis=1, keepdims=True) / np.sqrt(len(values))
+        z = moments.mean(axis=(1, 2)) / error[:, 0]
+        assert z.shape == (2, NUM_STEPS)
+        assert np.abs(z).max() < 4, z
