@@ -460,6 +460,8 @@ REFUSED = (
     ("component: 1 is dead",
      lambda: paths(run(Filter(MODEL, [Propagate(MODEL)], 4, 2)), component=1)),
     ("mixtures: these are not all", lambda: paths(HISTORY.final)),
+    (r"mixtures: \[ParticleMixture\(particles=f32\[4\], .* is not", lambda: paths([MIXTURE])),
+    (r"q: 90 is not in \[0, 1\]", lambda: MIXTURE.quantile(MIXTURE.particles, 90)),
     (r"trajectory: float32\[4\] .* is not float32\[3\]", lambda: around(trajectory=np.ones(4))),
     *(
         (f"filter: .*{words}", lambda filter=filter: around(filter))
@@ -479,6 +481,8 @@ REFUSED = (
     ("run: its filter keeps no first", lambda: log_marginal_likelihood_variance(HISTORY)),
     ("runs: 1; a standard error asks for 4", lambda: batch_estimate(HISTORY, nothing)),
     # tuning
+    (r"num_samples: 800 .* num_moves \+ 1: 798 or 804", lambda: tuning.smc2(
+        KEY, OF_SCALAR, TWO, 800, sample_prior=flat, log_prior=flat, **OF_A)),
     ("(?s)filter: .* none of its moves is approximate", lambda: chain(GAUSSIAN)),
     (r"proposal_deviations: those of \['b'\]", lambda: chain(proposal_deviations={"b": 1.0})),
     ("log_prior: -inf at the start", lambda: chain(log_prior=lambda p: 0 * p["a"] - jnp.inf)),

@@ -74,17 +74,14 @@ def _online(**options):
 def _stepwise(key, filter, observations, inputs=None):
     """The terms at t - L, and after the last step those that are left; NaN is missing."""
     smoother = FixedLagSmoother(filter, statistics_for(filter.model), LAG, "mcmc", 3)
-    key, key_start = jax.random.split(key)
-    window, rows, increments = smoother.init(filter.init(key_start)), [], []
-    observations = np.asarray(observations)
-    for t, own in enumerate(jax.random.split(key, len(observations))):
-        seen = None if np.isnan(observations[t]).all() else observations[t]
-        given = None if inputs is None else inputs[t]
-        window, found, info = smoother.step(own, window, seen, inputs=given)
-        rows += [found[0]] * (t >= LAG)
+    key, *keys = jax.random.split(key, 1 + len(observations))
+    window, rows, increments = smoother.init(filter.init(key)), [], []
+    for t, seen in enumerate(np.asarray(observations)):
+        seen, given = None if np.isnan(seen).all() else seen, None if inputs is None else inputs[t]
+        window, found, info = smoother.step(keys[t], window, seen, inputs=given)
+        rows.append(found[0])
         increments.append(info.log_likelihood_increment)
-    left = found[-min(LAG, len(observations)) :]
-    return jnp.stack(increments), jnp.stack([*rows, *left])
+    return jnp.stack(increments), jnp.stack([*rows[LAG:], *found[-min(LAG, len(rows)) :]])
 
 
 def _conditional(key, filter, observations, trajectory, inputs=None):

@@ -60,9 +60,8 @@ def test_of_what_comes_next():
     groups, dims, coords = to_inference_data(result, ahead)
     assert set(groups["posterior_predictive"]) == {"observation", "state_ahead_speed"}
     assert dims["observation"] == ["ahead", "observation_dim_1"]
-    assert dims["state_ahead_speed"] == ["ahead"]
-    np.testing.assert_array_equal(coords["ahead"], [1, 2, 3, 4])
-    np.testing.assert_array_equal(coords["time"], np.arange(6))
+    assert coords["ahead"].tolist() == [1, 2, 3, 4]
+    assert coords["time"].tolist() == list(range(6))
 
 
 def test_of_smc2_samples_count_as_often_as_they_weigh():

@@ -1,6 +1,6 @@
 """What comes next over the posterior of parameters and states, against the exact distribution."""
 
-from functools import cache
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ import mpfjax
 from mpfjax import Series
 from mpfjax.exact import kalman_filter
 from mpfjax.tuning import metropolis_hastings, particle_gibbs, posterior_predictive, smc2
+from mpfjax.tuning.evidence import pose_evidence
 from tests.marking import exactness
 from tests.tuning.exact_posteriors import Pushed
 
@@ -39,7 +40,6 @@ OF_D = {"parameters": {"d": lambda filter: filter.model.d}, "progress": False}
 CHAINS = {"num_chains": 100, "burn_in": 30} | OF_D
 
 
-@cache
 def exact_moments():
     """Of x and y after the last observation, by a Kalman filter of the state (x, d)."""
     m = jax.tree.map(float, Drifting())
@@ -61,6 +61,9 @@ def sample_prior(key):
     return {"d": jax.random.normal(key)}
 
 
+PRIOR = {"log_prior": log_prior, "sample_prior": sample_prior}
+
+
 def draw(key, trajectory, observations, model):
     """d given the trajectory, by the steps' residuals."""
     rest = trajectory[1:] - model.a * trajectory[:-1] - SERIES.inputs
@@ -70,21 +73,25 @@ def draw(key, trajectory, observations, model):
 
 
 def by_metropolis():
-    options = {"log_prior": log_prior, "sample_prior": sample_prior, "proposal_deviations": 0.8}
-    run = metropolis_hastings(KEY, FILTER, SERIES, 200, **options, **CHAINS)
+    run = metropolis_hastings(KEY, FILTER, SERIES, 200, proposal_deviations=0.8, **PRIOR, **CHAINS)
     own = jax.random.wrap_key_data(run.key_data[3, 7])
     again = run.problem.objective(own, run.problem.having({"d": run.parameters["d"][3, 7]}))
     assert float(again) == pytest.approx(run.log_marginal_likelihoods[3, 7], abs=1e-4)
+    of_two = pose_evidence(FILTER, [SERIES, SERIES], OF_D["parameters"], None)
+    with pytest.raises(ValueError, match="posterior: it is given several sequences"):
+        posterior_predictive(KEY, replace(run, problem=of_two), 1)
     return run
 
 
 def by_gibbs():
-    return particle_gibbs(KEY, FILTER, SERIES, 200, draw=draw, **CHAINS)
+    run = particle_gibbs(KEY, FILTER, SERIES, 200, draw=draw, **CHAINS)
+    with pytest.raises(ValueError, match="posterior: its trajectories are not whole"):
+        posterior_predictive(KEY, replace(run, trajectories=run.trajectories[:, :, 1:]), 1)
+    return run
 
 
 def by_smc2():
-    options = {"log_prior": log_prior, "sample_prior": sample_prior, "num_moves": 3}
-    return smc2(KEY, FILTER, SERIES, 4000, **options, **OF_D)
+    return smc2(KEY, FILTER, SERIES, 4000, num_moves=3, **PRIOR, **OF_D)
 
 
 @pytest.mark.parametrize("sample", [by_metropolis, *exactness([by_gibbs, by_smc2])])
