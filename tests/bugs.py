@@ -171,6 +171,12 @@ BUGS = {
         "log_weights=jnp.where(filled, jnp.log(trust / jnp.sum(trust)), -jnp.inf),",
         "tests/test_initial.py -k represent",
     ),
+    "an object among clutter is never missed": Bug(
+        "models/clutter.py",
+        "jnp.log1p(-p)[None]",
+        "jnp.log1p(-p - 0.05)[None]",
+        "tests/models/test_clutter.py -k plain",
+    ),
     # vision and metrics
     "histograms count half a pixel off": Bug(
         "vision/colour/histograms.py",

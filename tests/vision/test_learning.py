@@ -118,7 +118,13 @@ def test_the_mean_product_of_innovations_is_the_cameras_variance(sigma, num_obje
     camera = jax.tree.map(jnp.asarray, CameraState.initial())
     step = jax.jit(
         lambda camera, seen: camera.after(
-            predicted, None, jnp.asarray(False), cost, jnp.full(4, 0.1), seen, jnp.ones(2)
+            predicted,
+            jnp.zeros((1, 2)),
+            jnp.asarray(False),
+            cost,
+            jnp.full(4, 0.1),
+            seen,
+            jnp.ones(2),
         )
     )
     kept = []
@@ -140,7 +146,9 @@ def test_a_shift_of_all_is_the_cameras_and_that_of_one_is_its_own():
     seen = rows + jnp.array([[0.7, 0, 0, 0]])
     seen = seen.at[2, 1].add(3.0)
     known = jnp.asarray(False)
-    _, shift = camera.after(predicted, None, known, cost, jnp.zeros(4), seen, jnp.ones(2))
+    _, shift = camera.after(
+        predicted, jnp.zeros((1, 2)), known, cost, jnp.zeros(4), seen, jnp.ones(2)
+    )
     np.testing.assert_allclose(shift, [0.7, 0.0], atol=0.02)
 
 
