@@ -135,10 +135,7 @@ def sound(run: FilterRun) -> FilterRun:
     is_blind = degenerate.any(axis=-1) & (degenerate | (np.asarray(increments) == 0)).all(axis=-1)
     if is_blind.any():
         which = f" in {is_blind.sum()} of {is_blind.size} runs" if is_blind.ndim else ""
-        warnings.warn(
-            f"every step with an observation was degenerate{which}: no particle had any likelihood,"
-            " and the particles follow the dynamics alone; mpfjax.check_model tries a model out",
-            RuntimeWarning,
-            stacklevel=3,
-        )
+        said = f"every step with an observation was degenerate{which}: no particle had any"
+        said += " likelihood; mpfjax.check_model tries a model out"
+        warnings.warn(said, RuntimeWarning, stacklevel=3)
     return run

@@ -40,9 +40,7 @@ def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:
     is_orphan = (mixtures.ancestor_indices < 0) & (mixtures.log_weights > -jnp.inf)
     found = jnp.any(is_orphan[1:])
     message = (
-        f"mixtures: {needed_by} follows ancestors, and some particles have none, or more than one"
-        " (index -1), as after PropagateIndependently; sample_trajectories with method 'exact' does"
-        " without"
+        f"mixtures: {needed_by} follows ancestors, and particles of index -1 have no single one"
     )
     if isinstance(found, Tracer):
         return eqx.error_if(mixtures, found, message)

@@ -176,9 +176,8 @@ def _warn_of_few(indices: Int[Array, "t k"], log_weights: Float[Array, "t n"]) -
     if shares[worst] < _SMALL_SHARE:
         warnings.warn(
             f"sample_trajectories: at index {few[worst]} of the times {counts[few[worst]]} of the"
-            f" {num_drawn} trajectories are distinct, a share of {shares[worst]:.2g}. The backward"
-            " weights degenerate: log_transition leaves a state next to no particle to have come"
-            " from but one. docs/smoothing.md says what to do",
+            f" {num_drawn} trajectories are distinct, a share of {shares[worst]:.2g}: the backward"
+            " weights degenerate, see docs/smoothing.md",
             RuntimeWarning,
             stacklevel=4,
         )

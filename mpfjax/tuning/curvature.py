@@ -87,11 +87,8 @@ def errors_at(
     informations = _informations(score, np.asarray(point), longest)
     covariance = _inverse(informations.mean(axis=0))
     if covariance is None:
-        warnings.warn(
-            "standard_errors: the log marginal likelihood has no maximum here, or too few seeds"
-            " to see it",
-            stacklevel=4,
-        )
+        said = "the log marginal likelihood has no maximum here, or too few seeds to see it"
+        warnings.warn(f"standard_errors: {said}", stacklevel=4)
         return None
     _warn_of_noise(informations, of_seeds)
     # By the Jacobian of the parameters on their own scale, laid out in the same order.
@@ -183,8 +180,5 @@ def _warn_of_noise(informations: Float[np.ndarray, "seeds d d"], of_seeds: str) 
     if apart <= _MOST_APART:
         return
     found = f"differ by {apart:.0%}" if np.isfinite(apart) else "may be no errors at all"
-    warnings.warn(
-        f"standard_errors: {num_seeds} seeds leave them uncertain, and rather too large: those of"
-        f" one half of the seeds and of the other half {found}; raise {of_seeds}",
-        stacklevel=5,
-    )
+    said = f"{num_seeds} seeds leave them uncertain: those of two halves {found}; raise {of_seeds}"
+    warnings.warn(f"standard_errors: {said}", stacklevel=5)

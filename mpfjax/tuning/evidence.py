@@ -90,12 +90,9 @@ def warn_of_bias(caller: str, problem: Problem) -> None:
     names = [name for name, index in problem.tuned if index not in of_proposals]
     moves = [move for move in _nodes(problem.tree, AbstractMove) if move.biases_score]
     if names and moves:
-        warnings.warn(
-            f"{caller}: the resampling of {type(moves[0]).__name__} has no gradient, so that the"
-            f" score of {', '.join(names)} is biased, however many particles there are; build the"
-            ' filter with gradient="stop", if need be of other moves',
-            stacklevel=4,
-        )
+        said = f"{caller}: {type(moves[0]).__name__} has no gradient, so that the score of"
+        said += f' {", ".join(names)} is biased; build the filter with gradient="stop"'
+        warnings.warn(said, stacklevel=4)
 
 
 def _nodes(tree: PyTree, kind: type) -> list[Any]:

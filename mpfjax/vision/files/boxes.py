@@ -25,10 +25,7 @@ TRACK_COLUMNS = range(7, 11)
 
 def parse_box(text: str, argument: str = "box") -> Float[np.ndarray, "4"]:
     """Read "x,y,w,h" in pixels. Raises `ValueError` naming `argument` for any other text."""
-    try:
-        box = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        box = np.zeros(0)
+    box = np.array([_number(part) for part in text.split(",")])
     if box.shape != (4,) or not np.all(np.isfinite(box)):
         raise ValueError(f"{argument}: {text!r} is not four numbers x,y,w,h")
     return box
