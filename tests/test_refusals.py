@@ -39,6 +39,7 @@ from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.running.islands import IslandInteraction
 from mpfjax.smoothing.variance import batch_estimate, log_marginal_likelihood_variance
+from tests.marking import weekly
 from tests.user_models import Batched, Drift, DriftOfOne, ScalarLinear
 
 pytestmark = pytest.mark.usefixtures("as_installed")
@@ -259,7 +260,9 @@ def calls(draw, functions):
     return function, GOOD[function] | {name: draw(values) for name in changed}, changed
 
 
-@pytest.mark.parametrize(("functions", "number"), [(BUILDERS, 500), (RUNNERS, 60)])
+@pytest.mark.parametrize(
+    ("functions", "number"), [(BUILDERS, 500), (RUNNERS, 60), *weekly([(BUILDERS, 5_000)])]
+)
 def test_calls_work_or_name_the_argument(functions, number):
     @settings(UNHURRIED, max_examples=number)
     @given(calls(functions))
