@@ -92,10 +92,8 @@ class AbstractStateSpaceModel(eqx.Module):
 def takes_inputs(model: Any) -> bool:
     """Whether a model takes u_t: it has a field `inputs`, or its own `with_inputs`."""
     model = _innermost(model)
-    if not isinstance(model, AbstractStateSpaceModel):  # of one particle
-        return hasattr(model, "with_inputs") or hasattr(model, "inputs")
-    is_default = type(model).with_inputs is AbstractStateSpaceModel.with_inputs
-    return "inputs" in type(model).__dataclass_fields__ or not is_default
+    own = getattr(type(model), "with_inputs", AbstractStateSpaceModel.with_inputs)
+    return hasattr(model, "inputs") or own is not AbstractStateSpaceModel.with_inputs
 
 
 def with_inputs(model: Any, inputs: PyTree) -> Any:

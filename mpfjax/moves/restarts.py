@@ -62,14 +62,11 @@ class Restart(AbstractMove):
         plain = getattr(self.resample, "resampling", None)
         fixed = plain is None or plain.ess_threshold < 1 or plain.particles_per_component
         if fixed:
-            raise ValueError(
-                f"resample: {shown(self.resample)} is no Resample of all components at every step,"
-                " which leaves slots for restarts"
-            )
+            what = "is no Resample of all components at every step, which leaves slots"
+            raise ValueError(f"resample: {shown(self.resample)} {what}")
         if not getattr(self.propagation, "draws_each", False):
-            raise ValueError(
-                f"propagation: {shown(self.propagation)} does not draw x_t of each x_(t-1)"
-            )
+            who = f"propagation: {shown(self.propagation)}"
+            raise ValueError(f"{who} does not draw x_t of each x_(t-1)")
 
     def map_inner(self, change: Callable[[Any], Any]) -> "Restart":
         """The same with another resampling and another propagation."""

@@ -100,9 +100,8 @@ class GroupBy(AbstractRegrouping):
         if dtype == jnp.bool_:
             labels, dtype = labels.astype(jnp.int32), jnp.int32
         if jnp.shape(labels) != (n,) or not jnp.issubdtype(dtype, jnp.integer):
-            raise ValueError(
-                f"function: it returned {shown(labels)}, not one whole number a particle, ({n},)"
-            )
+            what = f"not one whole number a particle, ({n},)"
+            raise ValueError(f"function: it returned {shown(labels)}, {what}")
         num_labels = mixture.num_components
         outside = mixture.occupied & ((labels < 0) | (labels >= num_labels))
         inside = jnp.clip(labels, 0, num_labels - 1).astype(jnp.int32)
