@@ -22,22 +22,19 @@ matplotlib.use("Agg")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 
-def known_to_xla(*flags: str) -> bool:
-    """Whether this version of XLA has the flags: it ends the process over one that it has not."""
+def tried(*flags: str) -> subprocess.Popen:
+    """A start of XLA with the flags, which ends the process over one that it has not."""
     start = [sys.executable, "-c", "import jax; jax.devices('cpu')"]
     environment = os.environ | {"XLA_FLAGS": " ".join(flags)}
-    return subprocess.run(start, env=environment, capture_output=True).returncode == 0
+    return subprocess.Popen(start, env=environment, stderr=subprocess.DEVNULL)
 
 
 # Most programs run once, on little: compiling them is what takes time. Workers, notebooks and
 # other processes inherit it. JAX 0.12 has no way around XLA's fusion emitters any more, which take
 # about twice as long to compile a filter as what they replace: there the first flag falls away.
 quick = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1") == "1"
-if quick and "XLA_FLAGS" not in os.environ:
-    flags = ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
-    if not known_to_xla(*flags):
-        flags = [flag for flag in flags if known_to_xla(flag)]
-    os.environ["XLA_FLAGS"] = " ".join(flags)
+flags = ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
+trial = tried(*flags) if quick and "XLA_FLAGS" not in os.environ else None
 
 # Workers and the processes that tests start take each other's programs, as modules do when those
 # from before were dropped (below). The folder is the session's, gone when it ends.
@@ -50,6 +47,11 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax  # noqa: E402
 
+# Meanwhile JAX is imported, which reads the flags when it first has something to compile.
+if trial is not None:
+    if trial.wait() != 0:
+        flags = [flag for flag in flags if tried(flag).wait() == 0]
+    os.environ["XLA_FLAGS"] = " ".join(flags)
 jax.config.update("jax_disable_most_optimizations", quick)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
