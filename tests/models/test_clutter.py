@@ -10,6 +10,7 @@ import scipy.stats
 
 import mpfjax
 from mpfjax import ClutteredModel, Filter, GroupBy, Propagate, Resample
+from tests.marking import quick_of
 from tests.unbiased import assert_unbiased
 
 KEY = jax.random.key(0)
@@ -62,7 +63,7 @@ CHAINS = {
 }
 
 
-@pytest.mark.parametrize("chain", list(CHAINS))
+@pytest.mark.parametrize("chain", quick_of(CHAINS, ["plain"]))
 def test_evidence_and_moments_are_those_of_all_associations(chain):
     exact, mean = by_associations(SETS)
     runs = mpfjax.monte_carlo(

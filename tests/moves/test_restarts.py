@@ -6,6 +6,7 @@ import pytest
 import scipy.stats
 
 import mpfjax
+from tests.marking import quick_of
 from tests.user_models import ScalarLinear
 
 MODEL = ScalarLinear()
@@ -39,7 +40,7 @@ FILTERS = {
 }
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("name", quick_of(FILTERS, ["mixture"]))
 def test_evidence_is_unbiased_for_the_kernel(name):
     filter = mpfjax.with_restarts(FILTERS[name], PROBABILITY)
     keys = jax.random.split(jax.random.key(0), SEEDS)
