@@ -140,13 +140,6 @@ def moved_by(
     return jax.tree.map(keep, moved, before), resampled & ~waits
 
 
-def check_mixture(mixture: ParticleMixture, num_components: int) -> None:
-    """Raise a `ValueError` for a mixture that a filter of this M cannot go on from."""
-    if mixture.num_components != num_components:
-        found = mixture.num_components
-        raise ValueError(f"mixture: num_components, {found}, is not the filter's, {num_components}")
-
-
 def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> ParticleMixture:
     """The result of a move; a `ValueError` unless it is a mixture of the same shapes and types."""
     who = f"moves: {name_of(move)} returned"

@@ -10,7 +10,6 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.chain import (
     StepInfo,
     check_chain,
-    check_mixture,
     forgetting,
     give_inputs,
     moved_by,
@@ -182,7 +181,8 @@ class Filter(eqx.Module):
     def _run(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree, inputs: PyTree
     ) -> tuple[ParticleMixture, StepInfo]:
-        check_mixture(mixture, self.num_components)
+        if (found := mixture.num_components) != (own := self.num_components):
+            raise ValueError(f"mixture: num_components, {found}, is not the filter's, {own}")
         inputs = one_input(inputs, self.model)
         *moved, faults = _one_step(self, key, mixture, observation, inputs)
         return raise_faults(tuple(moved), faults)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import POSITIVE, Fitting, entries, to_array
+from mpfjax.checks import POSITIVE, SHARES, Fitting, to_array
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     is_made_of_noise,
@@ -20,7 +20,6 @@ from mpfjax.models.base import (
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.steps import own_likelihoods
 
-_SHARE = entries(lambda array: (array >= 0) & (array <= 1), "in [0, 1]")
 # What the object's model has beside its three methods and its likelihood of one measurement.
 _PASSED_ON = (
     "log_transition", "log_initial", "with_history", "initial_from_noise", "transition_from_noise",
@@ -64,7 +63,7 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
 
     object_model: AbstractStateSpaceModel
     detection_probability: (
-        Annotated[Float[Array, ""], _SHARE] | Callable[[PyTree], Float[Array, " n"]]
+        Annotated[Float[Array, ""], SHARES] | Callable[[PyTree], Float[Array, " n"]]
     ) = eqx.field(converter=_number_or_function("detection_probability"))
     clutter_density: (
         Annotated[Float[Array, ""], POSITIVE] | Callable[[PyTree], Float[Array, ""]]

@@ -14,9 +14,9 @@ from mpfjax.checks import (
     FINITE,
     NOT_NEGATIVE,
     POSITIVE,
+    SHARES,
     Fitting,
     InnerShare,
-    entries,
     to_array,
     to_numbers,
 )
@@ -178,11 +178,6 @@ class RandomWalkWithJumps(RandomWalk):
         return jnp.logaddexp(log_odds[0] + short, log_odds[1] + long)
 
 
-Shares = Annotated[
-    tuple[float, ...], entries(lambda shares: (shares >= 0) & (shares <= 1), "in [0, 1] throughout")
-]
-
-
 class WalkWithVelocity(AbstractDynamics):
     """x_t = x_{t-1} + v_{t-1} + e_t and v_t = v_{t-1} + gain · e_t, with e_t a step of `walk`.
 
@@ -207,7 +202,9 @@ class WalkWithVelocity(AbstractDynamics):
     order = 2
 
     walk: RandomWalk
-    gain: Shares = eqx.field(static=True, converter=to_numbers("gain"), default=0.1)
+    gain: Annotated[tuple[float, ...], SHARES] = eqx.field(
+        static=True, converter=to_numbers("gain"), default=0.1
+    )
     initial_velocity: Annotated[Float[Array, "*n d"], NOT_NEGATIVE] | None = eqx.field(
         converter=to_array("initial_velocity"), default=None
     )

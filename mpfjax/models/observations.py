@@ -79,10 +79,9 @@ def steps_of_inputs(
     inputs: PyTree, length: int, model: Any, of_what: str = "observations"
 ) -> PyTree:
     """u_1, ..., u_t as arrays; a `ValueError` unless they are finite numbers, one for each step."""
-    if inputs is None:
+    arrays = one_input(inputs, model)
+    if arrays is None:
         return None
-    _require_place_for(inputs, model)
-    arrays = as_arrays(inputs, "inputs")
     own_length = _length(arrays, inputs, "inputs")
     if own_length != length:
         raise ValueError(f"inputs: their t is {own_length}, and that of the {of_what} is {length}")
@@ -93,14 +92,10 @@ def one_input(inputs: PyTree, model: Any) -> PyTree:
     """The arrays of u_t; a `ValueError` for anything but numbers, or a model without inputs."""
     if inputs is None:
         return None
-    _require_place_for(inputs, model)
-    return as_arrays(inputs, "inputs")
-
-
-def _require_place_for(inputs: PyTree, model: Any) -> None:
     if not takes_inputs(model):
         place = "a field `inputs: PyTree = None`, nor with_inputs, where u_t would go"
         raise ValueError(f"inputs: {model_name(model)} has neither {place}")
+    return as_arrays(inputs, "inputs")
 
 
 def as_arrays(observations: PyTree, name: str = "observations") -> PyTree:

@@ -12,7 +12,6 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import checked, shown, to_rows
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.propagate import predict
@@ -53,8 +52,7 @@ class Partitioned(AbstractPropagation):
     "prior", its mass. If all weight is lost, the particles move by their dynamics alone.
 
     Raises `ValueError` for an order that is no permutation of the objects, a number of orders other
-    than one or the number of components, an unknown reassembly, and gradient "stop" with an object
-    model that has no `log_transition`.
+    than one or the number of components, and an unknown reassembly.
     """
 
     model: MultiObjectModel
@@ -95,8 +93,6 @@ class Partitioned(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate and weigh the objects of every particle in its component's order."""
         num_objects = self.model.num_objects
-        if self._stops_draws:
-            require(self.model.object_model, "log_transition", "gradient='stop'")
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects + 1)
         orders = self._orders(keys[-1], mixture.num_components)
