@@ -223,6 +223,7 @@ class Reweight(AbstractPropagation):
     """it weighs the trajectory as any other."""
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         if self.exponent != 1:
             refuse_marginalised(self.model, "a part of the likelihood", "take exponent 1")
 
