@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
+import jax
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from mpfjax.checks import Count, Share, checked
@@ -18,7 +20,7 @@ from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, Reassembly
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
-from mpfjax.moves.regrouping.features import Scale
+from mpfjax.moves.regrouping.features import OnCircles, Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
 from mpfjax.moves.regrouping.merge import Merge
 from mpfjax.moves.regrouping.partitions import Pool, RandomPartition
@@ -130,7 +132,7 @@ def mixture_particle_filter(
     plain = particle_filter(
         model, num_particles, proposal=proposal, scheme=scheme, ess_threshold=ess_threshold
     )
-    seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
+    seen = _seen(model, features, scale)
     filter = _mixture(plain, max_components, seen, _WARM_ITERATIONS, regroup, regroup_every)
     if max_components > 1:
         filter = with_selected_start(filter)
@@ -194,7 +196,7 @@ def gaussian_mixture_particle_filter(
     plain = gaussian_particle_filter(
         model, num_particles, proposal=proposal, regeneration=regeneration, importance=importance
     )
-    seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
+    seen = _seen(model, features, scale)
     return _mixture(plain, max_components, seen, _ITERATIONS, regroup, regroup_every)
 
 
@@ -295,6 +297,18 @@ def clustered_particle_filter(
     """
     move = PropagateInClusters(model, start, split_after, scheme=scheme)
     return Filter(model, moves=[move], num_particles=num_particles)
+
+
+def _seen(
+    model: AbstractStateSpaceModel, features: Callable[[PyTree], Array] | None, scale: Scale
+) -> dict[str, Any]:
+    """What the grouping moves see: by default the state, on circles where the model has periods."""
+    periods = jax.tree.leaves(getattr(model, "periods", None))
+    if features is None and periods:
+        features = OnCircles(tuple(np.concatenate([*map(np.ravel, periods)]).tolist()))
+    else:
+        features = mapped(model, features)
+    return {"features": features, "scale": scale}
 
 
 def _mixture(

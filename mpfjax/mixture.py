@@ -6,7 +6,7 @@ from typing import Annotated, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int, PyTree, Shaped
 
 from mpfjax.checks import SHARES, as_numbers, checked
 from mpfjax.operations.logarithms import (
@@ -183,34 +183,55 @@ class ParticleMixture(eqx.Module):
         filled = jnp.where(_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
         return self.component_sums(_rows(weights, values) * filled)
 
-    def component_means(self) -> PyTree:
+    def component_means(self, periods: PyTree = None) -> PyTree:
         """The weighted mean of each component: every leaf (m, ...), zero for a dead one.
 
         Leaves that are not floating point are averaged as `component_averages` does.
+
+        - `periods`: of the numbers that go round, as angles do, in the form of one state: for a
+          pose `np.array([0, 0, 2 * np.pi])`, zero for what does not. Their mean is the direction of
+          the mean vector on the circle (Mardia and Jupp 2000), and at most half a period.
         """
-        means = jax.tree.map(self.component_averages, self.particles)
+        means = _averages(self.component_averages, self.particles, periods)
         if not isinstance(means, MarginalisedState):
             return means
         within = self._component_spread(self.particles.mean)
         return means._replace(covariance=means.covariance + within)
 
-    def component_covariances(self) -> Float[Array, "m d d"]:
-        """The weighted covariance of each component's flattened state, zero for a dead one."""
-        covariances = self._component_spread(flatten_states(self.particles))
+    def component_covariances(self, periods: PyTree = None) -> Float[Array, "m d d"]:
+        """The weighted covariance of each component's flattened state, zero for a dead one.
+
+        With `periods`, see `component_means`, what goes round differs from its mean by the shorter
+        way.
+        """
+        if periods is not None:
+            widened = lambda leaf, period: jnp.broadcast_to(period, leaf[:1].shape)  # noqa: E731
+            every = jax.tree.map(widened, points(self.particles), points(periods))
+            periods = flatten_states(every)[0]
+        covariances = self._component_spread(flatten_states(self.particles), periods)
         if not isinstance(self.particles, MarginalisedState):
             return covariances
         d = self.particles.mean.shape[1]
         within = self.component_averages(self.particles.covariance)
         return covariances.at[:, -d:, -d:].add(within.astype(covariances.dtype))
 
-    def _component_spread(self, values: Float[Array, "n d"]) -> Float[Array, "m d d"]:
+    def _component_spread(
+        self, values: Float[Array, "n d"], periods: Float[Array, " d"] | None = None
+    ) -> Float[Array, "m d d"]:
         """The weighted covariance of the values in each component."""
-        centred = values - spread(self.component_averages(values), self.component_indicators)
+        means = _averages(self.component_averages, values, periods)
+        centred = values - spread(means, self.component_indicators)
+        if periods is not None:
+            turns = jnp.round(centred / jnp.where(periods > 0, periods, jnp.inf)[None])
+            centred -= periods[None] * turns
         return self.component_averages(centred[:, :, None] * centred[:, None, :])
 
-    def mean(self) -> PyTree:
-        """E[x_t | y_1..y_t], leaf by leaf, over the whole mixture; see `average`."""
-        means = jax.tree.map(self.average, self.particles)
+    def mean(self, periods: PyTree = None) -> PyTree:
+        """E[x_t | y_1..y_t], leaf by leaf, over the whole mixture; see `average`.
+
+        `periods` is that of `component_means`.
+        """
+        means = _averages(self.average, self.particles, periods)
         if not isinstance(means, MarginalisedState):
             return means
         centred = self.particles.mean - means.mean[None]
@@ -350,6 +371,22 @@ def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
     leaves = [as_inexact(leaf.reshape(leaf.shape[0], -1)) for leaf in leaves]
     widest = max((leaf.dtype for leaf in leaves), key=lambda dtype: jnp.finfo(dtype).bits)
     return jnp.concatenate([leaf.astype(widest) for leaf in leaves], axis=1)
+
+
+def _averages(average: Callable[[Array], Array], values: PyTree, periods: PyTree) -> PyTree:
+    """The averages of the values, leaf by leaf, on a circle where there is a period."""
+    if periods is None:
+        return jax.tree.map(average, values)
+
+    def on_circle(values: Array, period: ArrayLike) -> Array:
+        mean, period = average(values), jnp.asarray(period)
+        scale = jnp.where(period > 0, period, 1.0) / (2 * jnp.pi)
+        angles = values / jnp.broadcast_to(scale, values.shape)
+        angle = jnp.arctan2(average(jnp.sin(angles)), average(jnp.cos(angles)))
+        angle = angle * jnp.broadcast_to(scale, mean.shape)
+        return jnp.where(jnp.broadcast_to(period > 0, mean.shape), angle, mean)
+
+    return jax.tree.map(on_circle, values, periods)
 
 
 def _numbers(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:

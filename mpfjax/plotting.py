@@ -1,9 +1,11 @@
 """Pictures of a run: its components over time. Only here matplotlib is used."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
@@ -24,6 +26,7 @@ def draw_components(
     index: CountOrZero = 0,
     *,
     truth: np.ndarray | None = None,
+    periods: PyTree = None,
     least_mass: Share = 0.01,
 ) -> Figure:
     """Each component's mean and two standard deviations over time, the darker the heavier.
@@ -34,6 +37,7 @@ def draw_components(
     - `mixtures`: with a leading axis of time, as `run_filter(..., collect=None).collected`.
     - `index`: which number of the flattened state is drawn; of a `MarginalisedState` the latent
       comes first, then x.
+    - `periods`: of what goes round, as in `ParticleMixture.component_means`.
     - `truth`: (t,), a line in black. `least_mass`: components of less mass are left out.
 
     Raises `ValueError` for an index that the state has not, and for mixtures without an axis of
@@ -41,7 +45,9 @@ def draw_components(
     """
     if mixtures.log_weights.ndim != 2:
         raise ValueError("mixtures: these are not all of one run; keep them by collect=None")
-    masses, means, variances = map(np.asarray, jax.vmap(_moments)(mixtures))
+    masses, means, variances = map(
+        np.asarray, jax.vmap(partial(_moments, periods=periods))(mixtures)
+    )
     if index >= means.shape[2]:
         raise ValueError(f"index: {shown(index)} of a state of {means.shape[2]} numbers")
     figure = Figure(figsize=(7.0, 3.4), layout="constrained")
@@ -71,11 +77,11 @@ def draw_components(
 
 
 def _moments(
-    mixture: ParticleMixture,
+    mixture: ParticleMixture, periods: PyTree
 ) -> tuple[Float[Array, " m"], Float[Array, "m d"], Float[Array, "m d"]]:
     """Masses, means and variances of the components."""
-    means = mixture.component_averages(flatten_states(mixture.particles))
-    covariances = mixture.component_covariances()
+    means = flatten_states(mixture.component_means(periods))
+    covariances = mixture.component_covariances(periods)
     # Rounding may leave a variance of zero slightly negative.
     variances = jnp.maximum(covariances.diagonal(axis1=1, axis2=2), 0.0)
     return mixture.mixture_weights, means, variances

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpfjax.mixture import flatten_states
-from mpfjax.moves.regrouping.features import ByFeatures
+from mpfjax.moves.regrouping.features import ByFeatures, OnCircles
 from tests.examples import example_mixtures, log_masses
 
 MIXTURES = example_mixtures()
@@ -63,6 +63,34 @@ def test_quantiles_are_those_of_the_weighted_distribution_function(mixture):
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), mixture)
     median = jax.vmap(lambda mixture: mixture.quantile(lambda states: states[:, 0], 0.5))(stack)
     np.testing.assert_array_equal(median, jnp.full(3, found[3, 0]))
+
+
+def test_what_goes_round_is_averaged_on_its_circle():
+    """A pose, in both forms of its state, against complex numbers."""
+    periods, rng = np.array([0.0, 4.0, 2 * np.pi], np.float32), np.random.default_rng(3)
+    states = rng.normal([1.0, 1.9, np.pi], 0.3, (40, 3)).astype(np.float32)
+    states[:, 1:] = (states[:, 1:] + periods[1:] / 2) % periods[1:] - periods[1:] / 2
+    mixture = MIXTURES["dead components"].replace(particles=jnp.asarray(states))
+    means, covariances = mixture.component_means(periods), mixture.component_covariances(periods)
+    within, weights = np.asarray(mixture.component_weights), np.asarray(mixture.weights)
+    for slots, mean, covariance in zip(members(mixture), means, covariances, strict=True):
+        if slots.size:
+            w, x = within[slots], states[slots]
+            turns = np.angle(w @ np.exp(2j * np.pi * x[:, 1:] / periods[1:])) / (2 * np.pi)
+            expected = np.array([w @ x[:, 0], *(turns * periods[1:])])
+            np.testing.assert_allclose(mean, expected, atol=1e-4)
+            gaps = x - expected
+            gaps[:, 1:] -= periods[1:] * np.round(gaps[:, 1:] / periods[1:])
+            np.testing.assert_allclose(covariance, (w[:, None] * gaps).T @ gaps, atol=1e-4)
+    states = mixture.particles
+    as_leaves = mixture.replace(particles={"x": states[:, :2], "heading": states[:, 2]})
+    found = as_leaves.mean({"x": periods[:2], "heading": periods[2]})
+    assert found["heading"] == pytest.approx(
+        np.angle(weights @ np.exp(1j * np.asarray(states[:, 2]))), 1e-4
+    )
+    # As features, near ones are as far apart as the numbers are.
+    near = OnCircles((0.0, 4.0))(jnp.array([[0.0, 1.999], [0.3, -1.999]]))
+    np.testing.assert_allclose(jnp.hypot(*(near[1] - near[0])[1:]), 0.002, rtol=0.01)
 
 
 def test_flattening_puts_all_leaves_side_by_side():

@@ -34,6 +34,9 @@ class AbstractStateSpaceModel(eqx.Module):
     A model may also define `log_transition(states, previous_states)`, log D of each particle, shape
     (n,). Guided proposals need it; the bootstrap proposal does not.
 
+    A class may set `periods`, in the form of one state: those of numbers that go round, as angles
+    do, and zero for all others. Recipes of mixtures then group particles on the circle.
+
     In place of `sample_transition`, a model may define how x_t is made of noise:
     `transition_from_noise(noise, states)`, whose `noise` is standard normal, (n, k), and
     `noise_dimension`, k. `sample_transition` then draws independent noise. A uniform number is
@@ -227,7 +230,7 @@ _BATCHED = (
 )  # fmt: skip
 _SHARED = (
     "transition_covariance", "observation_covariance", "prepare_observation", "noise_dimension",
-    "initial_noise_dimension",
+    "initial_noise_dimension", "periods",
 )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """The features of the state that regrouping uses, and their units."""
 
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -50,6 +50,26 @@ class ByFeatures(Checked):
             one, *others = self.scale
             values = values / (jnp.array(self.scale, values.dtype)[None] if others else one)
         return jnp.where(mixture.occupied[:, None], values - origin(values, mixture)[None], 0.0)
+
+
+class OnCircles(NamedTuple):
+    """The flattened state as features; what goes round becomes a point on its circle.
+
+    - `periods`: of each number of the flattened state, zero for what does not go round. A number of
+      period P gives two features, (P / 2π) cos and (P / 2π) sin, so that near ones are as far apart
+      as the numbers are.
+    """
+
+    periods: tuple[float, ...]
+
+    def __call__(self, states: PyTree) -> Float[Array, "n k"]:
+        """The features of each particle."""
+        columns = []
+        for column, period in zip(flatten_states(states).T, self.periods, strict=True):
+            radius = period / (2 * np.pi)
+            circle = lambda x, r: [r * jnp.cos(x / r), r * jnp.sin(x / r)]  # noqa: E731
+            columns += circle(column, radius) if period else [column]
+        return jnp.stack(columns, axis=1)
 
 
 def origin(values: Float[Array, "n k"], mixture: ParticleMixture) -> Float[Array, " k"]:
