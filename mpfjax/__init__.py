@@ -74,6 +74,7 @@ from mpfjax.running.studies import read_study as read_study
 from mpfjax.running.studies import run_study as run_study
 from mpfjax.smoothing.forecasts import forecast as forecast
 from mpfjax.transforms import map_moves as map_moves
+from mpfjax.transforms import with_alarm as with_alarm
 from mpfjax.transforms import with_lookahead as with_lookahead
 from mpfjax.transforms import with_point_sets as with_point_sets
 from mpfjax.transforms import with_proposals_per_particle as with_proposals_per_particle

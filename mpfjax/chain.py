@@ -21,6 +21,8 @@ from mpfjax.operations.logarithms import (
     scaled_log_sum_exp,
 )
 
+# In the memory while a move reads it: the growth of the mass in the step so far.
+INCREMENT = "log_increment"
 BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
@@ -47,12 +49,21 @@ class StepInfo(eqx.Module):
     is one of `mpfjax.smoothing.with_first_ancestors`."""
     mixture_weight_errors: Float[Array, " m"] | None = None
     """the standard error of each mixture weight; None likewise."""
+    log_evidence_against_start: Float[Array, ""] | None = None
+    """log of p(y_t | x_{t-1} ~ p_0) over p(y_t | y_1..y_{t-1}): how much y_t speaks for a state
+    that begins anew, against all that the filter knows; None unless a move tells it, as in
+    `with_alarm` and `with_restarts`."""
 
 
 def step_info(
-    mixture: ParticleMixture, increment: Float[Array, ""], resampled: Bool[Array, " m"]
+    moves: Moves,
+    mixture: ParticleMixture,
+    observation: PyTree,
+    increment: Float[Array, ""],
+    resampled: Bool[Array, " m"],
 ) -> StepInfo:
     """The report of a step that ended in this mixture."""
+    told = (move.evidence_against(mixture, observation, increment) for move in moves)
     degenerate = increment == -jnp.inf
     of_evidence = of_masses = None
     # Families may have members on several islands.
@@ -70,6 +81,7 @@ def step_info(
         labels_ran_out=jnp.all(sizes > 0) & (mixture.num_components > 1),
         log_marginal_likelihood_error=of_evidence,
         mixture_weight_errors=of_masses,
+        log_evidence_against_start=next((each for each in told if each is not None), None),
     )
 
 
@@ -88,7 +100,7 @@ def check_chain(moves: Moves, num_particles: int, num_components: int) -> None:
     if not any(move.weighs for move in moves):
         who = f"moves: {names or 'none'}"
         raise ValueError(f"{who} never weigh the particles by what is observed, as Propagate does")
-    kept = [name for move in with_inner(moves) for name in move.own_memory]
+    kept = [name for move in with_inner(moves) for name in move.own_memory] + [INCREMENT]
     read = {name for move in with_inner(moves) for name in move.reads}
     for name in sorted(read | set(kept)):
         if kept.count(name) != 1:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.chain import (
+    INCREMENT,
     StepInfo,
     check_chain,
     forgetting,
@@ -130,7 +131,10 @@ class Filter(eqx.Module):
             draw = self._sample_initial
             particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
         mixture = single_component(particles, self.num_components)
-        mixture = mixture.replace(memory=initial_memory(self.moves, self.num_components))
+        memory = initial_memory(self.moves, self.num_components)
+        if self._reads_increment:
+            memory[INCREMENT] = jnp.zeros((), mixture.log_weights.dtype)
+        mixture = mixture.replace(memory=memory)
         for move_key, move in zip(keys, self.initial_moves, strict=True):
             mixture = move(move_key, mixture, observation)
         if self.looks_at_first:
@@ -142,6 +146,10 @@ class Filter(eqx.Module):
     def looks_at_first(self) -> bool:
         """Whether the initial moves may weigh x_0, by y_1 or otherwise."""
         return any(move.weighs for move in self._initial_moves)
+
+    @property
+    def _reads_increment(self) -> bool:
+        return any(INCREMENT in move.reads for move in self._moves)
 
     def with_inputs(self, inputs: PyTree) -> "Filter":
         """The filter at a step whose known inputs are u_t, which every model in it receives.
@@ -195,6 +203,8 @@ class Filter(eqx.Module):
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
+            if self._reads_increment:
+                mixture = mixture.replace(memory=mixture.memory | {INCREMENT: increment})
             moved, redrawn = moved_by(move, move_key, mixture, observation, self)
             if observation is not None and not move.keeps_mass:
                 moved, log_growth = normalised(moved, mixture)
@@ -202,7 +212,7 @@ class Filter(eqx.Module):
             resampled |= redrawn
             mixture = forgetting(self.moves, moved)
         mixture = mixture.replace(parents=None, in_order=False)
-        return mixture, step_info(mixture, increment, resampled)
+        return mixture, step_info(self.moves, mixture, observation, increment, resampled)
 
 
 _one_step = jit_with_floats_traced(step_and_faults)

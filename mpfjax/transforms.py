@@ -10,13 +10,13 @@ from mpfjax.checks import Count, InnerShare, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead, PilotLookahead
 from mpfjax.moves.base import AbstractMove
-from mpfjax.moves.initial import SelectInitial
+from mpfjax.moves.initial import SelectInitial, sample_initial
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.moves.restarts import RegroupOthers, Restart
+from mpfjax.moves.restarts import RegroupOthers, Restart, WatchStart
 from mpfjax.proposals import AbstractProposal
 
 
@@ -156,6 +156,19 @@ def with_restarts(
         for move in apart.moves
     ]
     return apart.replace(moves=moves, num_components=filter.num_components + 1)
+
+
+@checked
+def with_alarm(filter: Filter, num_draws: Count = 4096) -> Filter:
+    """The filter that says when all its hypotheses seem wrong: `FilterRun.surprised`.
+
+    At each step the increment is compared with the evidence for a state that begins anew: draws of
+    x_0, made once, which cost as much as so many particles of a plain filter. `with_restarts` has
+    the same evidence from its own draws. Use it where a lost target must be noticed.
+    """
+    propagation = _propagation_of(filter, "draws of x_0 are compared")
+    draws = sample_initial(jax.random.key(0), filter.model, num_draws)
+    return filter.replace(moves=[*filter.moves, WatchStart(propagation, draws)])
 
 
 def _propagation_of(filter: Filter, what: str) -> Any:

@@ -93,7 +93,7 @@ GOOD = {
     **alike({"filter": FILTER}, mpfjax.with_lookahead, mpfjax.with_point_sets,
             mpfjax.with_score_gradient),
     **alike({"filter": FILTER, "num_draws": 2}, mpfjax.with_selected_start,
-            mpfjax.with_proposals_per_particle, mpfjax.with_restarts),
+            mpfjax.with_proposals_per_particle, mpfjax.with_restarts, mpfjax.with_alarm),
     **alike({"model": MODEL, "num_particles": 4}, mpfjax.particle_filter,
             mpfjax.gaussian_particle_filter),
     **alike({"model": MODEL, "num_particles": 4, "max_components": 2},

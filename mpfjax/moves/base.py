@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import Checked, check, is_series, shown
 from mpfjax.mixture import ParticleMixture
@@ -93,9 +93,20 @@ class AbstractMove(Checked):
         del change
         return self
 
+    def evidence_against(
+        self, mixture: ParticleMixture, observation: PyTree, increment: Float[Array, ""]
+    ) -> Float[Array, ""] | None:
+        """The report's `log_evidence_against_start` after a step; None of a move that has none."""
+        del mixture, observation, increment
+        return None
+
     @property
     def reads(self) -> frozenset[str]:
-        """The names of the memory of other moves that this move needs."""
+        """The names of the memory of other moves that this move needs.
+
+        A filter itself keeps "log_increment" for moves that read it: the growth of the mass in the
+        step so far, which after a propagation is log p(y_t | y_1..y_{t-1}).
+        """
         return frozenset()
 
     @property

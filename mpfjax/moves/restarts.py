@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import Count, InnerShare, shown
-from mpfjax.mixture import ParticleMixture
+from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, Regrouped
 from mpfjax.moves.initial import chosen, sample_initial, two_looks
 from mpfjax.operations.logarithms import log_sum_exp
@@ -99,7 +99,9 @@ class Restart(AbstractMove):
     ) -> ParticleMixture:
         key_resample, key_drawn, key_look, key_chosen = split(key, 4)
         n, last = mixture.num_particles, mixture.num_components - 1
-        surprise = self._surprise(mixture)
+        # The cumulative sum after the step before; bounded, so that it ends when they are right.
+        against = self.evidence_against(mixture, observation, jnp.zeros(()))
+        surprise = jnp.clip(mixture.memory[SURPRISE] + against, 0.0, 2 * ALARM)
         most = max(1, round(self.share * n))
         least = max(1, round(QUIET_PART * most))
         number = jnp.where(surprise > ALARM, most, least).astype(jnp.int32)
@@ -143,12 +145,53 @@ class Restart(AbstractMove):
         labels = survivors.component_indicators
         return survivors.replace(component_indicators=jnp.where(labels == last, joined, labels))
 
-    def _surprise(self, mixture: ParticleMixture) -> Float[Array, ""]:
-        """The cumulative sum after the step before; zero before there have been restarts."""
+    def evidence_against(
+        self, mixture: ParticleMixture, observation: PyTree, increment: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """The odds of the draws of x_0 after the step, over p / (1 - p)."""
+        del observation, increment
         log_masses = mixture.log_mixture_weights
         log_odds = log_masses[-1] - log_sum_exp(log_masses[:-1])
-        log_factor = log_odds - jnp.log(self.probability / (1 - self.probability))
-        return jnp.maximum(mixture.memory[SURPRISE] + log_factor, 0.0)
+        return log_odds - jnp.log(self.probability / (1 - self.probability))
+
+
+class WatchStart(AbstractMove):
+    """A move that changes nothing, and compares the filter at each step with draws of x_0.
+
+    The report's `log_evidence_against_start` is log of the mean of p(y_t | x_{t-1}) over the draws,
+    less the increment. `with_alarm` makes a filter with it.
+
+    - `propagation`: draws x_t of each draw of x_0, and weighs it: usually the filter's own.
+    - `draws`: of x_0, the same at every step.
+    """
+
+    propagation: Any
+    draws: PyTree
+
+    weighs = False
+    keeps_mass = True
+    keeps_trajectories = True
+
+    def map_inner(self, change: Callable[[Any], Any]) -> "WatchStart":
+        """The same with another propagation."""
+        return WatchStart(change(self.propagation), self.draws)
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """The mixture itself."""
+        del key, observation
+        return mixture
+
+    def evidence_against(
+        self, mixture: ParticleMixture, observation: PyTree, increment: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """log mean p(y_t | x_{t-1}) less the increment; zero where y_t is missing."""
+        del mixture
+        if observation is None:
+            return jnp.zeros_like(increment)
+        anew = self.propagation(jax.random.key(0), single_component(self.draws), observation)
+        return jax.lax.stop_gradient(anew.log_mass - increment)
 
 
 class RegroupOthers(AbstractRegrouping):

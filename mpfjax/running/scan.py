@@ -1,8 +1,10 @@
 """One run of a filter as one scan, and its result."""
 
+import inspect
 import math
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,6 +18,7 @@ from mpfjax.checks import saying
 from mpfjax.filter import Filter, StepInfo
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import Series
+from mpfjax.moves.restarts import ALARM, SURPRISE
 from mpfjax.operations.logarithms import num_islands
 from mpfjax.operations.random import split, split_for_run, split_keys
 
@@ -35,6 +38,20 @@ class FilterRun(eqx.Module):
     """which components each step resampled."""
     degenerate: Bool[Array, " t"]
     """the steps at which every particle had zero likelihood."""
+    log_evidence_against_start: Float[Array, " t"] | None = None
+    """that of each step's `StepInfo`, and None unless a move of the filter tells it."""
+
+    @property
+    def surprised(self) -> Bool[Array, "*t"] | None:
+        """The steps at which all hypotheses seem wrong; None without that evidence.
+
+        Its cumulative sum, which never falls below zero, is then above 5: a CUSUM (Page 1954).
+        """
+        if self.log_evidence_against_start is None:
+            return None
+        sums = jnp.cumsum(jnp.clip(self.log_evidence_against_start, -50.0, 50.0), axis=-1)
+        lowest = jax.lax.cummin(jnp.minimum(sums, 0.0), axis=sums.ndim - 1)
+        return sums - lowest > ALARM
 
 
 def scan(
@@ -49,18 +66,31 @@ def scan(
     keys_initial, keys = split_for_run(key, num_initial, series.length, num_moves)
 
     def advance(
-        mixture: ParticleMixture, step: tuple[Array, Series]
+        mixture: ParticleMixture, step: tuple[Array, Series, Array | None]
     ) -> tuple[ParticleMixture, PyTree]:
-        step_keys, now = step
+        step_keys, now, t = step
         mixture, info = step_or_predict(filter, step_keys, mixture, now)
         with saying("in collect, which is called with the mixture after each step"):
-            kept = mixture if collect is None else collect(mixture)
+            given: tuple[Any, ...] = (mixture,) if t is None else (mixture, t, now.inputs)
+            kept = mixture if collect is None else collect(*given)
         return mixture, (kept, report_of(info))
 
     if initial is None:
         initial = first_mixture(keys_initial, filter, series)
-    final, outputs = jax.lax.scan(advance, initial, (keys, series))
+    times = jnp.arange(1, series.length + 1) if takes_time(collect) else None
+    final, outputs = jax.lax.scan(advance, initial, (keys, series, times))
     return run_of(initial, final, *outputs)
+
+
+def takes_time(collect: Any) -> bool:
+    """Whether `collect` takes (mixture, t, u_t), and not the mixture alone."""
+    try:
+        inspect.signature(collect).bind(None)
+    except TypeError:
+        return collect is not None
+    except ValueError:  # functions not written in Python cannot be inspected
+        pass
+    return False
 
 
 def initial_keys(key: Key[Array, ""], filter: Filter) -> Key[Array, " i"]:
@@ -87,13 +117,16 @@ def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> P
     return mixture.replace(log_scale=mixture.log_scale - log_islands)
 
 
-Report = tuple[Float[Array, "*t"], Bool[Array, "*t m"], Bool[Array, "*t"]]
+Report = tuple[
+    Float[Array, "*t"], Bool[Array, "*t m"], Bool[Array, "*t"], Float[Array, "*t"] | None
+]
 """What a run keeps of a step's report, or of those of all steps."""
 
 
 def report_of(info: StepInfo) -> Report:
     """The part of a step's report that a run keeps."""
-    return info.log_likelihood_increment, info.resampled, info.degenerate
+    of_evidence = info.log_evidence_against_start
+    return info.log_likelihood_increment, info.resampled, info.degenerate, of_evidence
 
 
 def run_of(
@@ -123,7 +156,8 @@ def step_or_predict(
 def sound(run: FilterRun) -> FilterRun:
     """The run, or an error where a density of the model was NaN or infinite.
 
-    A RuntimeWarning, one for all runs, where no step of a run had any likelihood.
+    A RuntimeWarning, one for all runs, where no step of a run had any likelihood, and another where
+    what was seen spoke against all hypotheses and no restarts follow.
     """
     increments = run.log_likelihood_increments
     if isinstance(increments, Tracer):
@@ -137,5 +171,15 @@ def sound(run: FilterRun) -> FilterRun:
         which = f" in {is_blind.sum()} of {is_blind.size} runs" if is_blind.ndim else ""
         said = f"every step with an observation was degenerate{which}: no particle had any"
         said += " likelihood; mpfjax.check_model tries a model out"
+        warnings.warn(said, RuntimeWarning, stacklevel=3)
+    surprised = run.surprised
+    # Restarts see to it themselves.
+    if surprised is not None and np.any(surprised) and SURPRISE not in run.final.memory:
+        steps, which = np.asarray(surprised), ""
+        if steps.ndim > 1:
+            which = f" in {steps.any(axis=-1).sum()} of {len(steps)} runs"
+        first = int(np.argmax(steps.reshape(-1, steps.shape[-1]).any(axis=0)))
+        said = f"what was seen speaks against all hypotheses{which}, first at index {first} of the"
+        said += " steps: run.surprised; mpfjax.with_restarts lets the state begin anew"
         warnings.warn(said, RuntimeWarning, stacklevel=3)
     return run

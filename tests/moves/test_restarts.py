@@ -1,11 +1,14 @@
 """Restarts: exact for their kernel, found again after being carried away, and cheap elsewhere."""
 
+import warnings
+
 import jax
 import numpy as np
 import pytest
 import scipy.stats
 
 import mpfjax
+from mpfjax.moves.restarts import SURPRISE
 from tests.marking import quick_of
 from tests.user_models import ScalarLinear
 
@@ -49,3 +52,81 @@ def test_evidence_is_unbiased_for_the_kernel(name):
     error = ratios.std() / np.sqrt(SEEDS)
     assert abs(ratios.mean() - 1) < 4 * error
     assert error < 0.06
+
+
+class Kidnapped(ScalarLinear):
+    """A walk on a line 40 units long, of which it is told where it is; its prior is the line."""
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.uniform(key, (num_particles,), minval=-20.0, maxval=20.0)
+
+
+def nothing(mixture):
+    return None
+
+
+@pytest.fixture(scope="module")
+def told():
+    """Eight runs each, carried away at the twentieth step of forty or not, with each alarm."""
+    rng = np.random.default_rng(0)
+    model = Kidnapped(a=1.0, q=0.1, r=0.2)
+    plain = mpfjax.mixture_particle_filter(model, 200, 3)
+    keys, found = jax.random.split(jax.random.key(1), 8), {}
+    for carried in (True, False):
+        places = np.where(np.arange(40) < 20, -10.0, 11.0 if carried else -10.0)
+        seen = (places + 0.2 * rng.normal(size=40)).astype(np.float32)
+        for name, change in (("alarm", mpfjax.with_alarm), ("restarts", mpfjax.with_restarts)):
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                run = mpfjax.monte_carlo(keys, change(plain), seen, nothing)
+            found[name, carried] = run, [str(each.message) for each in caught]
+    return found
+
+
+@pytest.mark.parametrize("name", ["alarm", "restarts"])
+def test_an_alarm_is_given_where_all_hypotheses_are_wrong(name, told):
+    (run, messages), (calm, silence) = told[name, True], told[name, False]
+    surprised = np.asarray(run.surprised)
+    assert surprised[:, 20:23].any(axis=1).all()
+    assert not surprised[:, :20].any()
+    assert not np.asarray(calm.surprised).any()
+    assert [each for each in messages if "speaks against all" in each and "in 8 of 8 runs" in each]
+    assert not [each for each in silence if "speaks against" in each]
+
+
+def test_after_a_restart_the_state_is_found_and_the_alarm_ends(told):
+    run, _ = told["restarts", True]
+    np.testing.assert_allclose(jax.vmap(lambda m: m.mean())(run.final), 11.0, atol=0.5)
+    assert not np.asarray(run.final.memory[SURPRISE] > 5).any()
+
+
+def test_the_evidence_is_that_of_the_prior_beside_the_increment(told):
+    """p(y | x_0 ~ U) is 1/40 within the line, up to the constant in the model's likelihood."""
+    run, _ = told["alarm", False]
+    found = run.log_evidence_against_start + run.log_likelihood_increments
+    np.testing.assert_allclose(found, -np.log(40), atol=0.4)
+
+
+class Watching(mpfjax.AbstractMove):
+    """Keeps what the step's increment is."""
+
+    keeps_mass = True
+    weighs = False
+    reads = frozenset({"log_increment"})
+
+    def initial_memory(self, num_components):
+        return {"seen": jax.numpy.zeros(())}
+
+    def __call__(self, key, mixture, observation):
+        return mixture.replace(memory=mixture.memory | {"seen": mixture.memory["log_increment"]})
+
+
+def test_moves_and_collect_see_the_increment_the_time_and_the_inputs():
+    plain = FILTERS["particle filter"]
+    filter = plain.replace(moves=[*plain.moves, Watching()])
+    collect = lambda mixture, t, inputs: (mixture.memory["seen"], t, inputs)  # noqa: E731
+    run = mpfjax.run_filter(jax.random.key(0), filter, OBSERVATIONS[:5], collect)
+    seen, times, inputs = run.collected
+    np.testing.assert_array_equal(seen, run.log_likelihood_increments)
+    np.testing.assert_array_equal(times, [1, 2, 3, 4, 5])
+    assert inputs is None
