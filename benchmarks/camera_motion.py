@@ -1,4 +1,4 @@
-"""How well the camera's motion is found from pixels, what that costs, and what it does to tracks.
+"""How well the camera's motion is found from pixels, and what that costs.
 
     python -m benchmarks.camera_motion [DIR ...]
 
@@ -9,9 +9,8 @@ frames with a motion, and `CPU ms` the processor's time for a frame, on one thre
 holds img/ and gt.txt. Its true motion is not known: `moved` is the motion of the picture's centre
 that was found, which is an error where the camera stands still.
 
-Then the tracker runs with the motion from pixels and from the detections alone, on detections that
-are simulated as for `benchmarks.tracking_by_detection --scene football`. Scores are means over
---seeds draws of these. Into --out DIR goes camera_motion.json.
+What it does to tracks say the scores of `python -m benchmarks.tracking_by_detection --scene
+football` with --camera-motion pixels and detections. Into --out DIR goes camera_motion.json.
 """
 
 import time
@@ -21,12 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness import AtLeast2, Count, Folders, Natural, command, data, table
+from benchmarks.harness import AtLeast2, Folders, Natural, command, data, table
 from benchmarks.tracking_by_detection import football
-from benchmarks.tracking_by_detection.__main__ import OF_SCORES, SCORES, Motion
-from mpfjax.metrics import multi_object_scores
-from mpfjax.vision import OpticalFlow, read_frames, read_truth, track
-from mpfjax.vision.tracking.track import online_rows
+from mpfjax.vision import OpticalFlow, read_frames, read_truth
 
 OF_MOTION = {
     "recording": "{recording}", "moved": "{moved:.3f}", "error": "{error:.3f}",
@@ -49,30 +45,24 @@ class Recording(NamedTuple):
         return width, height
 
 
-@command(frames=4, seeds=1)
+@command(frames=4)
 def main(
     folders: Folders = (),
     *,
     seed: Natural = 0,
-    seeds: Count = 3,
     frames: AtLeast2 = 300,
     out: Path = Path("results/camera_motion"),
 ) -> None:
-    """Both tables, written after each recording.
+    """The table, written after each recording.
 
     - `folders`: img/ and gt.txt.
-    - `seeds`: draws of the detections.
     - `frames`: the most of a recording.
     """
     found: list[dict[str, Any]] = []
-    tracked: list[dict[str, Any]] = []
     for recording in recordings(folders, seed, frames):
         found.append(accuracy(recording))
-        own = range(seed, seed + seeds)
-        tracked += [scores(recording, "detections", own), scores(recording, "pixels", own)]
-        data(out / "camera_motion.json", found=found, tracked=tracked)
+        data(out / "camera_motion.json", found=found)
     print(table(OF_MOTION, found))
-    print(table({"recording": "{recording}", "motion from": "{motion}"} | OF_SCORES, tracked))
     print(f"written to {out}")
 
 
@@ -88,7 +78,7 @@ def recordings(folders: Sequence[Path], seed: int, most: int) -> Iterator[Record
 
 
 def accuracy(recording: Recording) -> dict[str, Any]:
-    """A row of the first table."""
+    """A row of the table."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -122,19 +112,6 @@ def accuracy(recording: Recording) -> dict[str, Any]:
 def root_mean_square(gaps: list[np.ndarray]) -> float:
     """Of the lengths of all gaps."""
     return float(np.sqrt(np.mean(np.sum(np.concatenate(gaps) ** 2, axis=1))))
-
-
-def scores(recording: Recording, motion: Motion, seeds: range) -> dict[str, Any]:
-    """A row of the second table: the tracker's mean scores."""
-    found = []
-    for seed in seeds:
-        match = football.Match(recording.name, 0, *recording.size[::-1])
-        rows = football.detect(match, recording.truth, seed)
-        tracked = track(iter(recording.frames), rows, camera_motion=motion)
-        kept = np.concatenate([online_rows(t, tracks) for t, tracks in enumerate(tracked, 1)])
-        found.append(multi_object_scores(kept, recording.truth, (1, len(recording.frames))))
-    means = {name: float(np.mean([one[name] for one in found])) for name in SCORES}
-    return {"recording": recording.name, "motion": motion} | means
 
 
 if __name__ == "__main__":

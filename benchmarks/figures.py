@@ -194,7 +194,10 @@ def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[st
             "marker": MARKERS[index % len(MARKERS)], "markevery": 1 + len(points) // 12,
         }  # fmt: skip
         x, y, *ends = np.array(sorted(points)).T
-        if ends:
+        if ends and len(points) > 12:
+            axis.plot(x, y, **style)
+            axis.fill_between(x, *ends, color=style["color"], alpha=0.2, lw=0)
+        elif ends:
             # Shifted a little, so that intervals at the same place do not cover each other.
             shift = index - (len(names) - 1) / 2
             x = x * 1.04**shift if scales[0] == "log" else x + 0.06 * step * shift

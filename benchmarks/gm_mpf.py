@@ -32,7 +32,6 @@ from benchmarks.scenes import boxes_over_time, football_scene
 from mpfjax.vision import read_truth
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
 from mpfjax.vision.colour.bins import HSVColours
-from mpfjax.vision.colour.histograms import integral_histogram
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
 
@@ -72,7 +71,7 @@ def main(
     - `sequence`: a folder with img/ and gt.txt.
     - `ids`: two objects of gt.txt.
     - `frames`: A:B, frames A to B, counted from 1, both in.
-    - `timed`: steps of each filter, and of each part of a step.
+    - `timed`: steps of each filter.
     - `reference`: particles, in four runs, of the filter that errors are measured from.
     """
     targets = open_targets(sequence, ids, frames, seed)
@@ -83,11 +82,8 @@ def main(
         {"source": targets.name, "seeds": seeds, "seed": seed, "frames": [targets.first, last]}
     )
     timing = times_of(filters_in_turns(targets, seed, names, timed), timed)
-    profile = times_of(parts_of_a_step(targets, seed), timed)
     print(f"time with colour histograms, {TIMED_PARTICLES} particles (table 1)")
     print(harness.table(TIMES, timing))
-    print("\nwhere the time of one frame goes")
-    print(harness.table({"part": "{name}", "ms": "{median:.3f}"}, profile))
     # What each mixture has with a great many particles, E(x_t | y_1..y_t), (t, 2 targets, 2): the
     # distance from it is what more particles can mend, and the rest of the distance from the true
     # box is the model's, or the annotation's.
@@ -108,7 +104,7 @@ def main(
         if name in own:
             errors = errors_of(step.estimates, own[name])
             results[-1]["monte_carlo_error"] = errors.mean(axis=0)
-        content = {"timing": timing, "profile": profile, "results": results}
+        content = {"timing": timing, "results": results}
         harness.data(out / "gm_mpf.json", settings=settings, **content)
     print(f"\ntwo targets of {targets.name}, {seeds} seeds; the reference has N = {reference}")
     print(harness.table(COLUMNS, results))
@@ -258,7 +254,7 @@ def run_filter(name: str, size: int, targets: Targets, seed: int, num_seeds: int
     return jax.tree.map(np.asarray, run.collected)
 
 
-# --- times: the filters in turns, and the parts of a step on their own --------------------------
+# --- times of the filters, in turns --------------------------------------------------------------
 
 
 def filters_in_turns(
@@ -277,24 +273,6 @@ def filters_in_turns(
         return mixtures[name]
 
     return {name: partial(advance, name) for name in filters}
-
-
-def parts_of_a_step(targets: Targets, seed: int) -> dict[str, Callable[[int], Any]]:
-    """Each part of a step on its own, with 1000 particles."""
-    model, still = make_model(targets), jnp.asarray(targets.stills[0])
-    table = integral_histogram(still, model.colours)
-    mixture = make_filter("mpf", model, TIMED_PARTICLES).init(jax.random.key(seed))
-    key, states = jax.random.key(seed + 1), mixture.particles
-    redraw = mpfjax.GaussianRegeneration(where=motion)
-    parts: dict[str, tuple[Callable[..., Any], Any, Any]] = {
-        "integral histogram of the frame": (integral_histogram, still, model.colours),
-        "likelihood of all boxes": (model.log_likelihood, table, states),
-        "dynamics": (model.sample_transition, key, states),
-        "resampling, two components": (mpfjax.Resample(), key, mixture),
-        "Gaussian regeneration, two components": (redraw, key, mixture),
-    }
-    programs = {name: eqx.filter_jit(part) for name, (part, *_) in parts.items()}
-    return {name: lambda _, name=name: programs[name](*parts[name][1:]) for name in parts}
 
 
 def times_of(runs: dict[str, Callable[[int], Any]], timed: int) -> list[dict[str, Any]]:

@@ -1,17 +1,12 @@
 """What a Kalman filter in every particle costs, and what it brings.
 
-    python -m benchmarks.marginalised --parts regimes
-    python -m benchmarks.marginalised --parts bearings
+    python -m benchmarks.marginalised
 
-`regimes`: a target with three regimes in four dimensions, which is the example of dynamax's
+A target with three regimes in four dimensions, which is the example of dynamax's
 `rbpfilter_optimal`. The error of the regimes' probabilities is that from a filter of --reference
 particles that looks at all children, as RMS over steps and seeds. The last column is the filter's
 error over that of the best of ours in the same time, between whose sizes the logarithms are
 interpolated.
-
-`bearings`: the scene of docs/masses.md, by the columns of `benchmarks.masses`: the mixture filter
-of 1000 particles, the same with marginalised velocity, and the filters of --learned-sizes that look
-ahead by what passes of 16 000 particles learned.
 
 Into --out DIR goes marginalised.json.
 """
@@ -19,7 +14,7 @@ Into --out DIR goes marginalised.json.
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,43 +24,30 @@ from jaxtyping import Array, Float, Key, PyTree
 import mpfjax
 from benchmarks import harness
 from benchmarks.harness import AtLeast2, Count, command
-from benchmarks.masses.__main__ import COLUMNS, measure, truth
-from benchmarks.masses.filters import FILTERS
-from benchmarks.masses.models import MarginalisedBearings
-from benchmarks.masses.scenes import SCENES
 
 Once = Callable[[int], Any]
 OURS = ("marginalised", "fully adapted", "all children")
 STAYS, DYNAMICS, ERRORS = 0.8, 0.2, 10 * np.array([2.0, 1.0, 2.0, 1.0])
 
 
-@command(steps=3, sizes=[10, 20], learned_sizes=[20], runs=3, seeds=2, repeats=2, reference=200)
+@command(steps=3, sizes=[10, 20], seeds=2, repeats=2, reference=200)
 def main(
     *,
-    parts: Sequence[Literal["regimes", "bearings"]] = ("regimes", "bearings"),
     sizes: Sequence[Count] = (10, 30, 100, 300, 1000, 3000),
-    learned_sizes: Sequence[Count] = (100, 150, 200, 1000),
-    runs: AtLeast2 = 100,
     steps: Count = 100,
     seeds: AtLeast2 = 20,
     repeats: Count = 15,
     reference: Count = 100_000,
     out: Path = Path("results/marginalised"),
 ) -> None:
-    """Part by part.
+    """The table.
 
-    - `sizes`: of the part on regimes.
-    - `learned_sizes`: of the part on bearings.
-    - `runs`: of the part on bearings.
-    - `repeats`: turns, each of all that run, of the part on regimes.
+    - `sizes`: N of each filter.
+    - `repeats`: turns, each of all that run.
     """
-    settings, found = harness.settings_of(locals()), {}
-    if "regimes" in parts:
-        found["regimes"] = regimes(sizes, steps, seeds, reference, repeats)
-        print(harness.table(None, found["regimes"]))
-    if "bearings" in parts:
-        found["bearings"] = bearings(learned_sizes, steps, runs, reference)
-        print(harness.table(COLUMNS, found["bearings"]))
+    settings = harness.settings_of(locals())
+    found = regimes(sizes, steps, seeds, reference, repeats)
+    print(harness.table(None, found))
     harness.data(out / "marginalised.json", settings=settings, results=found)
     print(f"results: {out}/")
 
@@ -169,21 +151,6 @@ def filtered(filter: mpfjax.Filter, observations: Array) -> Once:
     return lambda seed: (
         mpfjax.run_filter(jax.random.key(seed), filter, observations, of_mixture).collected
     )
-
-
-def bearings(sizes: Sequence[int], steps: int, runs: int, reference: int) -> list[dict[str, Any]]:
-    """Errors and time of each filter."""
-    scene, size = SCENES["bearings"][0](steps, 0), 1000
-    velocity, plain = MarginalisedBearings(), FILTERS["MPF"]
-    filters = {
-        ("MPF", size): plain(scene, size),
-        ("MPF, marginalised velocity", size): plain(scene._replace(model=velocity), size),
-    }
-    name = "MPF, learned look-ahead"
-    learned = FILTERS[name](scene, size)
-    filters |= {(name, fewer): learned.replace(num_particles=fewer) for fewer in sizes}
-    rows = measure(scene, truth(scene, reference, 1), filters, runs, 0)
-    return [row | dict(zip(("filter", "N"), row["filter"], strict=True)) for row in rows]
 
 
 if __name__ == "__main__":

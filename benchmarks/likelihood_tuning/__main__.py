@@ -1,7 +1,6 @@
-"""Which gradients of a filter's likelihood can be trusted, and tuning by those that can.
+"""Which gradients of a filter's likelihood can be trusted.
 
-Part a: bias, spread and time of every gradient estimator against exact scores. Part b: σ_x and
-σ_y of the quadratic model tuned from random starts, against the exact maximum. Run with
+Bias, spread and time of every gradient estimator against exact scores. Run with
 `python -m benchmarks.likelihood_tuning`; `--help` lists the options.
 """
 
@@ -13,17 +12,13 @@ from typing import Annotated, Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array
-from scipy.optimize import minimize
 
 import mpfjax
 from benchmarks import harness
 from benchmarks.harness import AtLeast2, Count, Seed, command
 from benchmarks.score_vs_particles import HIGH, LOW, simulate
 from mpfjax.exact import grid_filter, kalman_filter
-from mpfjax.tuning import Positive, fit
-from mpfjax.tuning.optimisation import TuningRun
 
 ESTIMATORS = {
     "none": "plain derivative",
@@ -35,65 +30,36 @@ MODELS = {"linear_gaussian": ("a", "log q", "log r"), "quadratic": ("log σ_x", 
 OBSERVATIONS = np.asarray(simulate(2)[1])
 
 
-@command(
-    runs=10, particles=[20], models=["quadratic"], filters=["pf"], estimators=["stop"], starts=1,
-    steps=2,
-)  # fmt: skip
+@command(runs=10, particles=[20], models=["quadratic"], filters=["pf"], estimators=["stop"])
 def main(
     *,
-    parts: Sequence[Literal["a", "b"]] = ("a", "b"),
     runs: Count = 200,
     particles: Sequence[AtLeast2] = (100, 1000),
     estimators: Sequence[Annotated[str, (*ESTIMATORS,)]] = (*ESTIMATORS,),
     models: Sequence[Annotated[str, (*MODELS,)]] = (*MODELS,),
     filters: Sequence[Literal["pf", "mpf"]] = ("pf", "mpf"),
-    starts: Count = 20,
-    steps: Count = 120,
     seed: Seed = 0,
     out: Path = Path("results/likelihood_tuning"),
 ) -> None:
-    """Run the parts that were asked for, print their tables, write their results.
+    """Cell by cell; what is finished is written.
 
-    - `runs`: a: seeds for each estimator.
-    - `particles`: a.
-    - `estimators`: a.
-    - `models`: a.
-    - `filters`: a.
-    - `starts`: b: random starts.
-    - `steps`: b: of each optimisation.
+    - `runs`: seeds for each estimator.
     """
     settings = harness.settings_of(locals())
-    if "a" in parts:
-        tasks = {"linear_gaussian": linear_gaussian_task(), "quadratic": quadratic_task()}
-        results = []
-        for model, size, filter, estimator in harness.grid(
-            "cell", models, particles, filters, estimators
-        ):
-            results.append(measure(model, filter, size, estimator, tasks[model], runs, seed))
-            harness.data(out / "scores.json", settings=settings, results=results)
-        print(score_tables(results))
-    if "b" in parts:
-        run_starts(starts, steps, seed, settings, out)
+    tasks = {"linear_gaussian": linear_gaussian_task(), "quadratic": quadratic_task()}
+    results = []
+    for model, size, filter, estimator in harness.grid(
+        "cell", models, particles, filters, estimators
+    ):
+        results.append(measure(model, filter, size, estimator, tasks[model], runs, seed))
+        harness.data(out / "scores.json", settings=settings, results=results)
+    print(score_tables(results))
     print(f"results: {out}/")
 
 
 def build_quadratic(point: Array) -> mpfjax.QuadraticModel:
     """σ_x and σ_y from their logarithms."""
     return mpfjax.QuadraticModel(jnp.exp(point[0]), jnp.exp(point[1]), LOW, HIGH)
-
-
-def exact_quadratic() -> Callable[[np.ndarray], tuple]:
-    """log Z and its gradient by the grid filter, under the precision of the caller."""
-    observations, points = jnp.asarray(OBSERVATIONS, float), jnp.linspace(-3.0, 3.0, 1201)
-
-    def log_evidence(point: Array) -> Array:
-        return grid_filter(build_quadratic(point), observations, points).log_marginal_likelihood
-
-    both = jax.jit(jax.value_and_grad(log_evidence))
-    return lambda point: tuple(np.asarray(v, float) for v in both(jnp.asarray(point, float)))
-
-
-# --- part a: bias, spread and time of every gradient estimator against exact scores ---------------
 
 
 # A model as a function of a few numbers, data, and the exact score at the true numbers.
@@ -122,10 +88,18 @@ def linear_gaussian_task() -> Task:
 
 
 def quadratic_task() -> Task:
-    """The quadratic model on the data of section 5.1, away from its maximum."""
+    """The quadratic model on the data of section 5.1, away from its maximum.
+
+    The exact score is that of the grid filter, in double precision.
+    """
     point = np.log([0.12, 0.12])
+
+    def log_evidence(point: Array) -> Array:
+        grid, observations = jnp.linspace(-3.0, 3.0, 1201), jnp.asarray(OBSERVATIONS, float)
+        return grid_filter(build_quadratic(point), observations, grid).log_marginal_likelihood
+
     with jax.enable_x64(True):
-        exact = exact_quadratic()(point)[1]
+        exact = np.asarray(jax.jit(jax.grad(log_evidence))(jnp.asarray(point, float)))
     return build_quadratic, jnp.asarray(OBSERVATIONS), jnp.asarray(point, jnp.float32), exact
 
 
@@ -190,80 +164,6 @@ def score_tables(results: list[dict[str, Any]]) -> str:
         title = f"{model}: bias ± standard error (deviation of one run) of the score, exact in ()"
         blocks.append(f"{title}\n{harness.table(columns, entries)}")
     return "\n\n".join(blocks)
-
-
-# --- part b: the quadratic model tuned from random starts, against the exact maximum --------------
-
-
-def exact_maximum() -> tuple[np.ndarray, np.ndarray]:
-    """The best σ_x and σ_y, and the standard errors of their logarithms, in double precision."""
-    with jax.enable_x64(True):
-        both = exact_quadratic()
-        found = minimize(
-            lambda point: tuple(-value for value in both(point)), np.log([0.1, 0.06]), jac=True
-        )
-        step = 1e-3
-        columns = [
-            (both(found.x - offset)[1] - both(found.x + offset)[1]) / (2 * step)
-            for offset in step * np.eye(2)
-        ]
-    covariance = np.linalg.inv((np.stack(columns) + np.stack(columns).T) / 2)
-    return np.exp(found.x), np.sqrt(np.diagonal(covariance))
-
-
-def run_starts(starts: int, steps: int, seed: int, settings: dict[str, Any], out: Path) -> None:
-    """Optimisation from every start, and compare with the exact maximum."""
-    best, errors = exact_maximum()
-    rng = np.random.default_rng(seed)
-    places = np.exp(rng.uniform(*np.log((0.04, 0.5)), size=(starts, 2)))
-    results: list[dict[str, Any]] = []
-    for ((k, start),) in harness.grid("start", enumerate(places)):
-        run = optimisation(jax.random.fold_in(jax.random.key(seed), k), start, steps)
-        results.append(compare(start, run, best, errors))
-        harness.data(
-            out / "starts.json", settings=settings, exact=best, exact_relative_errors=errors,
-            results=results,
-        )  # fmt: skip
-    numbers = lambda form, values: " ".join(form.format(value) for value in values)  # noqa: E731
-    columns = {
-        "start": lambda entry: numbers("{:.3f}", entry["start"]),
-        "end": lambda entry: numbers("{:.4f}", entry["end"]),
-        "off by": lambda entry: numbers("{:+.1%}", entry["relative_error"]),
-        "standard errors / exact": lambda e: numbers("{:.2f}", e["standard_errors_over_exact"]),
-    }
-    print(harness.table(columns, results))
-    near = sum(np.abs(entry["relative_error"]).max() < 0.03 for entry in results)
-    print(f"{near} of {starts} end within 3% of the exact maximum,", end=" ")
-    print(numbers("{:.4f}", best))
-
-
-def optimisation(key: Array, start: np.ndarray, num_steps: int) -> TuningRun:
-    """The guided mixture particle filter's likelihood, climbed from one start."""
-    model = mpfjax.QuadraticModel(float(start[0]), float(start[1]), LOW, HIGH)
-    filter = mpfjax.mixture_particle_filter(
-        model, 200, 2, proposal=mpfjax.GaussNewtonProposal(model), noise="rqmc", gradient="stop"
-    )
-    optimiser = optax.adam(optax.cosine_decay_schedule(0.15, num_steps))
-    return fit(
-        key, filter, jnp.asarray(OBSERVATIONS), optimiser, num_steps,
-        parameters={"sigma_x": lambda f: f.model.sigma_x, "sigma_y": lambda f: f.model.sigma_y},
-        transforms={"sigma_x": Positive(), "sigma_y": Positive()},
-        num_seeds=16, curvature_seeds=128, progress=False,
-    )  # fmt: skip
-
-
-def compare(
-    start: np.ndarray, run: TuningRun, best: np.ndarray, exact_errors: np.ndarray
-) -> dict[str, Any]:
-    """Where an optimisation ended, and its standard errors, relative to the exact ones."""
-    both = lambda of: np.array([of["sigma_x"], of["sigma_y"]], float)  # noqa: E731
-    end, errors = both(run.parameters), None
-    if run.standard_errors is not None:
-        errors = both(run.standard_errors) / end / exact_errors
-    return {
-        "start": start, "end": end, "relative_error": end / best - 1,
-        "standard_errors_over_exact": errors, "stopped": run.stopped,
-    }  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -19,10 +19,6 @@ def _plain(**options: Any) -> Make:
     )
 
 
-def _auxiliary(scene: Scene, num_particles: int) -> mpfjax.Filter:
-    return mpfjax.auxiliary_particle_filter(scene.model, num_particles, scene.lookahead)
-
-
 def _mixture(**options: Any) -> Make:
     return lambda scene, num_particles: mpfjax.mixture_particle_filter(
         scene.model, num_particles, scene.max_components, **scene.grouping, **options
@@ -32,21 +28,6 @@ def _mixture(**options: Any) -> Make:
 def _changed(make: Make, change: Callable[[mpfjax.Filter], mpfjax.Filter]) -> Make:
     """The filters of another row after a change."""
     return lambda scene, num_particles: change(make(scene, num_particles))
-
-
-def _ahead(scene: Scene, num_particles: int) -> mpfjax.Filter:
-    """The mixture filter with the look-ahead of its scene."""
-    return mpfjax.with_lookahead(_mixture()(scene, num_particles), scene.lookahead)
-
-
-def _tempered(scene: Scene, num_particles: int) -> mpfjax.Filter:
-    """The mixture filter with a tempered propagation in place of its own."""
-    plain = _mixture()(scene, num_particles)
-    moves = [
-        mpfjax.PropagateTempered(scene.model) if isinstance(move, mpfjax.Propagate) else move
-        for move in plain.moves
-    ]
-    return plain.replace(moves=moves)
 
 
 def _learned(scene: Scene, num_particles: int) -> mpfjax.Filter:
@@ -61,15 +42,11 @@ _FOUR_DRAWS = partial(mpfjax.with_proposals_per_particle, num_draws=4)
 FILTERS: dict[str, Make] = {
     "PF": _plain(),
     "PF, rqmc": _plain(noise="rqmc"),
-    "APF": _auxiliary,
-    "APF, rqmc": _changed(_auxiliary, mpfjax.with_point_sets),
     "MPF": _mixture(),
     "MPF, equal slots": _changed(_mixture(), _EQUAL_SLOTS),
     "MPF, rqmc": _mixture(noise="rqmc"),
     "MPF, rqmc, no look-ahead": _changed(_mixture(), mpfjax.with_point_sets),
     "MPF, 4 draws": _changed(_mixture(), _FOUR_DRAWS),
     "MPF, rqmc, 4 draws": _changed(_mixture(noise="rqmc"), _FOUR_DRAWS),
-    "MPF, look-ahead": _ahead,
-    "MPF, tempered": _tempered,
     "MPF, learned look-ahead": _learned,
 }

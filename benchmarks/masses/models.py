@@ -171,10 +171,6 @@ class Mirror(_FromNoise):
         places = states[:, :2] + states[:, 2:] + 0.5 * pushed
         return jnp.concatenate([places, states[:, 2:] + pushed], axis=1)
 
-    def transition_mean(self, states: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
-        """A step without a push."""
-        return self.transition_from_noise(jnp.zeros_like(states[:, :2]), states)
-
     def log_likelihood(
         self, observation: Float[Array, "2"], states: Float[Array, "n 4"]
     ) -> Float[Array, " n"]:
@@ -274,11 +270,6 @@ class Bearings(_FromNoise):
             "mode": mode,
         }
 
-    def transition_mean(self, states: PyTree) -> PyTree:
-        """The same mode, and no push."""
-        motion = states["motion"]
-        return states | {"motion": _moved(motion, states["mode"], jnp.zeros_like(motion[:, :2]))}
-
     def log_likelihood(self, observation: Float[Array, "2"], states: PyTree) -> Float[Array, " n"]:
         """Of two angles."""
         return _log_of_angles(observation, states["motion"])
@@ -299,64 +290,6 @@ def motion_and_turn(states: PyTree) -> Float[Array, "n 5"]:
     """The motion, and the angle by which the mode turns it: the mode's number says nothing."""
     turn = jnp.asarray(_TURNS)[states["mode"]]
     return jnp.concatenate([states["motion"], turn[:, None]], axis=1)
-
-
-class MarginalisedBearings(mpfjax.AbstractConditionallyLinearModel):
-    """`Bearings` in the mixed form: the position moves by the velocity, which has no draws.
-
-    The latent is the position, the mode, and the number that draws the next mode. The rest is the
-    velocity and the next push: it moves position and velocity alike, so that no noise is shared.
-    """
-
-    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n 4"]:
-        """Straight on, around the point between the two arrays."""
-        noise = mpfjax.normal(key, (num_particles, 3))
-        position = _START[None, :2] + _SPREAD[None, :2] * noise[:, :2]
-        return jnp.concatenate([position, jnp.zeros_like(noise[:, :1]), noise[:, 2:]], axis=1)
-
-    def initial_moments(self, latent: Float[Array, "n 4"]) -> tuple[Array, Array]:
-        """Of velocity and push."""
-        del latent
-        deviations = jnp.array([*_SPREAD[2:], _ACCELERATION, _ACCELERATION], jnp.float32)
-        return jnp.zeros(4), jnp.diag(deviations**2)
-
-    def latent_dynamics(self, previous_latent: Float[Array, "n 4"]) -> tuple[Array, Array, Array]:
-        """The mean of both velocities is added to the position; the next mode is known."""
-        mode = _drawn_mode(previous_latent[:, 3], previous_latent[:, 2].astype(jnp.int32))
-        moved = [previous_latent[:, :2], mode[:, None].astype(jnp.float32)]
-        offset = jnp.concatenate([*moved, jnp.zeros((len(mode), 1))], axis=1)
-        half = 0.5 * jnp.eye(2)[None]
-        of_velocity = half + 0.5 * _turned(mode)
-        matrix = jnp.concatenate([of_velocity, jnp.broadcast_to(half, of_velocity.shape)], axis=2)
-        return (
-            offset,
-            jnp.pad(matrix, ((0, 0), (0, 2), (0, 0))),
-            jnp.diag(jnp.array([0.0, 0.0, 0.0, 1.0])),
-        )
-
-    def dynamics(
-        self, latent: Float[Array, "n 4"], previous_latent: Float[Array, "n 4"]
-    ) -> tuple[Array, Array, Array]:
-        """The velocity turns and is pushed; the next push is new."""
-        del previous_latent
-        turned = _turned(latent[:, 2].astype(jnp.int32))
-        identity = jnp.broadcast_to(jnp.eye(2), turned.shape)
-        matrix = jnp.pad(jnp.concatenate([turned, identity], axis=2), ((0, 0), (0, 2), (0, 0)))
-        variance = _ACCELERATION**2
-        return matrix, jnp.zeros(4), jnp.diag(jnp.array([0.0, 0.0, variance, variance]))
-
-    def emission(self, latent: Float[Array, "n 4"]) -> None:
-        """The bearings say nothing of the velocity, given the position."""
-        del latent
-
-    def log_likelihood(self, observation: Float[Array, "2"], states: PyTree) -> Float[Array, " n"]:
-        """Of two angles."""
-        return _log_of_angles(observation, states)
-
-
-def _turned(mode: Array) -> Float[Array, "n 2 2"]:
-    cos, sin = (jnp.asarray(f(_TURNS), jnp.float32)[mode] for f in (np.cos, np.sin))
-    return jnp.stack([jnp.stack([cos, -sin], 1), jnp.stack([sin, cos], 1)], 1)
 
 
 # --- a vehicle above a landscape, which knows its speed and its height above ground ---------------

@@ -23,7 +23,6 @@ class Scene(NamedTuple):
 
     - `region`: which region each particle is in, (n,), at the end; there are `num_regions`.
     - `grouping`: the coordinates and units in which components are grouped.
-    - `lookahead`: (y_t, states) -> log ν of each particle, for resampling ahead.
     - `exact`: the masses and log Z, where a grid or symmetry tells them; else None.
     - `features`: of a state, by which a look-ahead is learned; None is the state itself.
     - `truth`: the region that the observations come from.
@@ -34,7 +33,6 @@ class Scene(NamedTuple):
     region: Callable[[PyTree], Array]
     max_components: int
     grouping: dict[str, Any]
-    lookahead: Callable[[PyTree, PyTree], Array]
     exact: tuple[np.ndarray, float | None] | None = None
     features: Callable[[PyTree], Array] | None = None
     truth: int = 0
@@ -45,19 +43,9 @@ class Scene(NamedTuple):
         return mixture.average(jax.nn.one_hot(self.region(mixture.particles), self.num_regions))
 
 
-def flattened(model: Any, moved: Callable[[PyTree], PyTree]) -> Callable[[PyTree, PyTree], Array]:
-    """The root of the likelihood of where a particle is expected: a look-ahead with long tails."""
-    return lambda observation, states: 0.5 * model.log_likelihood(observation, moved(states))
-
-
 def by_sign(states: Array) -> Array:
     """On which side of zero."""
     return (states > 0).astype(jnp.int32)
-
-
-def itself(states: PyTree) -> PyTree:
-    """The place where a particle is."""
-    return states
 
 
 def of_grid(model: Any, observations: np.ndarray, grid: Array) -> tuple[np.ndarray, float]:
@@ -73,7 +61,6 @@ def corridor(num_steps: int, seed: int) -> Scene:
     path, observations = model.simulated(num_steps, seed)
     return Scene(
         model, observations, lambda states: model.section(states, path[-1]), 8, {"scale": 1.0},
-        flattened(model, lambda states: states + model.speed),
         exact=(np.full(4, 1 / 4), None), num_regions=4,
     )  # fmt: skip
 
@@ -86,7 +73,7 @@ def quadratic(num_steps: int, seed: int) -> Scene:
     observations = (path**2 + 0.1 * rng.normal(size=num_steps)).astype(np.float32)
     exact = of_grid(model, observations, GRID)
     return Scene(
-        model, observations, by_sign, 2, {}, flattened(model, itself), exact=exact,
+        model, observations, by_sign, 2, {}, exact=exact,
         truth=int(path[-1] > 0),
     )  # fmt: skip
 
@@ -94,14 +81,9 @@ def quadratic(num_steps: int, seed: int) -> Scene:
 def bearings(num_steps: int, seed: int) -> Scene:
     """A target on either side of two lines of hydrophones."""
     model = models.Bearings()
-
-    def place(states: PyTree) -> Array:
-        """Also of states whose velocity is marginalised."""
-        return states["motion"][:, :2] if isinstance(states, dict) else states.latent[:, :2]
-
     return Scene(
-        model, model.simulated(num_steps, seed), lambda states: by_sign(place(states)[:, 1]), 4,
-        {"features": place, "scale": 4.0}, flattened(model, model.transition_mean),
+        model, model.simulated(num_steps, seed), lambda states: by_sign(states["motion"][:, 1]), 4,
+        {"features": lambda states: states["motion"][:, :2], "scale": 4.0},
         features=models.motion_and_turn, truth=1,
     )  # fmt: skip
 
@@ -112,7 +94,7 @@ def mirror(num_steps: int, seed: int) -> Scene:
     return Scene(
         model, model.simulated(num_steps, seed), lambda states: by_sign(states[:, 1]), 4,
         {"features": lambda states: states[:, :2], "scale": 1.0},
-        flattened(model, model.transition_mean), exact=(np.array([0.5, 0.5]), None), truth=1,
+        exact=(np.array([0.5, 0.5]), None), truth=1,
     )  # fmt: skip
 
 
@@ -126,8 +108,7 @@ def terrain(num_steps: int, seed: int) -> Scene:
         return (jnp.sum((states - place[None]) ** 2, axis=1) < NEAR**2).astype(jnp.int32)
 
     return Scene(
-        model, observations, is_near, 8, {"scale": 1.0},
-        flattened(model, lambda states: states + model.velocity[None]), truth=1,
+        model, observations, is_near, 8, {"scale": 1.0}, truth=1,
     )  # fmt: skip
 
 
@@ -137,7 +118,7 @@ def jumps(num_steps: int, seed: int) -> Scene:
     path, observations = model.simulated(num_steps, seed + 4)
     exact = of_grid(model, observations, JUMP_GRID)
     return Scene(
-        model, observations, by_sign, 4, {"scale": 1.0}, flattened(model, itself), exact=exact,
+        model, observations, by_sign, 4, {"scale": 1.0}, exact=exact,
         truth=int(path[-1] > 0),
     )  # fmt: skip
 

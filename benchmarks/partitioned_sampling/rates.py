@@ -91,33 +91,17 @@ def _within(value: float, reach: float) -> list[float]:
     return [max(value - reach, 0.0), min(value + reach, 1.0)]
 
 
-def how_far_apart(shares: np.ndarray, num_runs: int, *, each_scene: bool) -> dict[str, float]:
-    """The least and the greatest share of the orders, and what chance alone would make of them.
+def how_far_apart(shares: np.ndarray, num_runs: int) -> dict[str, float]:
+    """The least and the greatest mean of the orders, and whether chance alone may part them.
 
-    `shares` is (scenes, orders); they are those of the orders' means over scenes, or the means of
-    `each_scene`'s. `p` is the probability of totals at least as uneven, if in each scene all orders
-    recover alike: a χ² test of the orders' sums over scenes.
+    `shares` is (scenes, orders). `p` is the probability of totals at least as uneven, if in each
+    scene all orders recover alike: a χ² test of the orders' sums over scenes.
     """
-    groups = shares[:, None] if each_scene else shares[None]
-    means = groups.mean(axis=1)
-    by_chance = np.mean([_by_chance(group, num_runs) for group in groups], axis=0)
-    own = shares.mean(axis=1)
+    means, own = shares.mean(axis=0), shares.mean(axis=1)
     variance, totals = (own * (1 - own)).sum() / num_runs, shares.sum(axis=0)
     statistic = ((totals - totals.mean()) ** 2).sum() / max(variance, 1e-12)
     return {
         "num_orders": shares.shape[1], "runs": num_runs, "mean": means.mean(),
-        "least": means.min(axis=1).mean(), "expected_least": by_chance[0],
-        "greatest": means.max(axis=1).mean(), "expected_greatest": by_chance[1],
+        "least": means.min(), "greatest": means.max(),
         "p": float(stats.chi2.sf(statistic, shares.shape[1] - 1)),
     }  # fmt: skip
-
-
-def _by_chance(shares: np.ndarray, num_runs: int) -> np.ndarray:
-    """The least and the greatest mean expected of orders that all recover alike in each scene."""
-    mass = np.ones(1)
-    for probability in shares.mean(axis=1):
-        mass = np.convolve(mass, stats.binom.pmf(np.arange(num_runs + 1), num_runs, probability))
-    below, num_orders = np.cumsum(mass).clip(0, 1), shares.shape[1]
-    # E[K] = Σ_k P(K > k) of a count K.
-    sums = ((1 - below) ** num_orders).sum(), (1 - below**num_orders).sum()
-    return np.array(sums) / (num_runs * len(shares))

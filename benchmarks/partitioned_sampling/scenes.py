@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 import mpfjax
 from benchmarks.partitioned_sampling import posterior
 from benchmarks.partitioned_sampling.posterior import Verdict, judge
-from benchmarks.scenes import NoPath, boxes_over_time, distracter_scene
+from benchmarks.scenes import NoPath, boxes_over_time, cover, distracter_scene
 from mpfjax import vision
 from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS, object_boxes
 
@@ -145,18 +144,6 @@ def real_scenes(folders: Sequence[Path]) -> Iterator[tuple[str, Scene]]:
     for event in found:
         scene = _real_scene(*event)
         yield scene.name, scene
-
-
-def cover(
-    box: Float[np.ndarray, "frames 4"], others: Float[np.ndarray, "frames objects 4"]
-) -> Float[np.ndarray, "frames objects"]:
-    """The share of a box that each other box before it covers, 0 where one is missing."""
-    box = box[:, None]
-    low = np.maximum(box[..., :2], others[..., :2])
-    high = np.minimum(box[..., :2] + box[..., 2:], others[..., :2] + others[..., 2:])
-    share = np.clip(high - low, 0, None).prod(axis=-1) / box[..., 2:].prod(axis=-1)
-    is_before = others[..., 1] + others[..., 3] > box[..., 1] + box[..., 3]
-    return np.where(is_before & np.isfinite(share), share, 0.0)
 
 
 def _events_of(j: int, ids: list[int], boxes: np.ndarray) -> list[Event]:

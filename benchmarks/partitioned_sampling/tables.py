@@ -101,11 +101,7 @@ def _means(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def orders_of(ps: Rows, circular: bool) -> list[dict[str, Any]]:
-    """How far the hard object's recovery by these orders lies apart, for each λ.
-
-    Of circular orders, which are read at different moments, within each scene; of others in the
-    mean over scenes.
-    """
+    """How far the hard object's recovery by these orders lies apart, for each λ."""
     entries = []
     for (lambda_,), rows in _grouped(ps, "lambda").items():
         scenes = [[row["rates"][list(row["rates"])[-1]]["recovery"] for row in group]
@@ -113,7 +109,7 @@ def orders_of(ps: Rows, circular: bool) -> list[dict[str, Any]]:
         if len({len(orders) for orders in scenes}) > 1 or len(scenes[0]) < 2:
             continue  # as many orders as objects, which real scenes differ in
         shares = np.array(scenes).mean(axis=(2, 3))
-        found = how_far_apart(shares, scenes[0][0].size, each_scene=circular)
+        found = how_far_apart(shares, scenes[0][0].size)
         orders = [str(row["order"]) for row in rows[: len(scenes[0])]]
         kind = "circular orders" if circular else "other cycles"
         recovery = dict(zip(orders, shares.mean(axis=0).tolist(), strict=True))
@@ -184,11 +180,9 @@ def print_tables(content: dict[str, Any]) -> None:
         print(harness.table(columns | {"runs": "{runs}"}, means))
     print(f"recovery in per cent, means over λ:\n{scene_table(content, table)}")
     if orders := content["circular_orders"] + content["other_cycles"]:
-        print("\nrecovery by the orders of PS, beside draws of one binomial; p: all are alike")
-        ends = {"worst": "least", "best": "greatest"}
+        print("\nrecovery by the orders of PS; p: all are alike")
         columns = {"λ": "{lambda:g}", "orders": "{num_orders} {kind}", "mean": "{mean:.1%}"}
-        for name, end in ends.items():
-            columns |= {name: f"{{{end}:.1%}}", f"{name} by chance": f"{{expected_{end}:.1%}}"}
+        columns |= {"worst": "{least:.1%}", "best": "{greatest:.1%}"}
         print(harness.table(columns | {"p": "{p:.2g}"}, orders))
     print("\nfigure 4 or 8: U/N in per cent, objects in their own order")
     objects = range(len(content["figure_4"][0]["uniqueness"]) if content["figure_4"] else 0)

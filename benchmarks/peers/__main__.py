@@ -1,7 +1,6 @@
 """How fast mpfjax is beside particles, blackjax and cuthbert, on the same jobs.
 
     python -m benchmarks.peers                        # whichever rivals are installed
-    python -m benchmarks.peers --devices 2            # and mpfjax on two host devices
 
 A bootstrap filter with systematic resampling at every step, for all seeds; mean, effective sample
 size and log-likelihood come out. Each library works in a process of its own, in the best way that
@@ -45,26 +44,23 @@ def main(
     jobs: Sequence[Annotated[str, (*JOBS,)]] = (*JOBS,),
     seeds: Annotated[int, whole(3)] = 20,
     repeats: Count = 9,
-    devices: Count = 1,
     out: Path = Path("results/peers"),
 ) -> int:
     """All cells in turn, each written as it is finished; 1 where a library was refused.
 
     - `seeds`: runs of each filter, at once.
     - `repeats`: times that each cell is timed.
-    - `devices`: mpfjax on so many, beside on one.
     """
     settings = harness.settings_of(locals())
     results: list[dict[str, Any]] = []
     for job in jobs:
         exact = exact_log_likelihood(JOBS[job])
         with ExitStack() as stack:
-            pools = {name: stack.enter_context(process()) for name in chosen_libraries(devices)}
+            pools = {name: stack.enter_context(process()) for name in chosen_libraries()}
             for size in sorted(particles):
                 if size <= MOST_PARTICLES[job]:
                     runs = {
-                        name: run_of(pool, name, job, devices, size, seeds)
-                        for name, pool in pools.items()
+                        name: run_of(pool, name, job, size, seeds) for name, pool in pools.items()
                     }
                     cell = {"job": job, "particles": size}
                     results += [cell | entry for entry in time_cell(runs, exact, repeats)]
@@ -76,21 +72,17 @@ def main(
     return int(any(entry["refused"] for entry in results))
 
 
-def chosen_libraries(num_devices: int) -> list[str]:
+def chosen_libraries() -> list[str]:
     """The names of what runs, mpfjax first; says which rival is not installed."""
     found = {name: importlib.util.find_spec(name.partition("_")[0]) for name in LIBRARIES}
     if missing := [name for name, spec in found.items() if spec is None]:
         print(f"not installed, see docs/speed.md: {', '.join(missing)}", file=sys.stderr)
-    chosen = [name for name, spec in found.items() if spec is not None]
-    return [name for name in chosen if num_devices > 1 or name != "mpfjax_devices"]
+    return [name for name, spec in found.items() if spec is not None]
 
 
-def run_of(
-    pool: ProcessPoolExecutor, name: str, job: str, num_devices: int, size: int, seeds: int
-) -> Run:
+def run_of(pool: ProcessPoolExecutor, name: str, job: str, size: int, seeds: int) -> Run:
     """A function of a seed: what a run in that process took, and what it found."""
-    number = num_devices if name == "mpfjax_devices" else 1
-    return lambda seed: pool.submit(run_once, name, job, number, size, seeds, seed).result()
+    return lambda seed: pool.submit(run_once, name, job, size, seeds, seed).result()
 
 
 def exact_log_likelihood(job: Job) -> float:
@@ -107,7 +99,7 @@ def exact_log_likelihood(job: Job) -> float:
 
 
 def time_cell(libraries: Mapping[str, Run], exact: float, repeats: int) -> list[dict[str, Any]]:
-    """One entry for each library: times in seconds, memory in bytes above the imports'.
+    """One entry for each library: times in seconds, memory in MB above the imports'.
 
     The first run of each is checked and counts as its start; then they take turns in random
     order. One that is slow is timed less often.
@@ -205,7 +197,7 @@ def _time(entry: Mapping[str, Any]) -> str:
 def _start(entry: Mapping[str, Any]) -> str:
     # What particles' other processes take is not seen from the first.
     is_seen = entry["library"] != "particles_2"
-    return f"{entry['start']:.1f} " + (f"{entry['memory'] / 1e6:5.0f}" if is_seen else "    -")
+    return f"{entry['start']:.1f} " + (f"{entry['memory']:5.0f}" if is_seen else "    -")
 
 
 def draw(results: list[dict[str, Any]]) -> Any:

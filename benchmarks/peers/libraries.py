@@ -18,7 +18,6 @@ from benchmarks.peers.jobs import Job, Quadratic
 
 LIBRARIES = {
     "mpfjax": "mpfjax",
-    "mpfjax_devices": "mpfjax, on --devices",
     "particles": "particles, 1 process",
     "particles_2": "particles, 2 processes",
     "blackjax": "blackjax",
@@ -51,7 +50,7 @@ def prepare(library: str, job: Job, num_particles: int, num_seeds: int) -> Prepa
     def make_keys(seed: int) -> Any:
         return jax.block_until_ready(jax.random.split(jax.random.key(seed), num_seeds))
 
-    if library.startswith("mpfjax"):
+    if library == "mpfjax":
         return Prepared(make_keys, through_mpfjax(job, num_particles))
     one_run = {"blackjax": through_blackjax, "cuthbert": through_cuthbert}[library]
     all_runs = jax.jit(jax.vmap(one_run(job, num_particles)))
@@ -107,39 +106,59 @@ def jax_functions(job: Job) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 
 def through_blackjax(job: Job, num_particles: int) -> Callable[[Any], tuple[Any, Any, Any]]:
-    """`smc.base.step` in a scan, as its docstring says: M_t, G_t and R_t of Feynman-Kac.
-
-    It hands `update_fn` a key for each particle. One of them draws for all, which is faster.
-    """
-    import jax
+    """Of one seed."""
     import jax.numpy as jnp
-    from blackjax.smc import base, resampling
 
     initial, transition = jax_functions(job)
     observations = jnp.asarray(job.observations)
 
+    def kept(state: Any, increment: Any) -> tuple[Any, Any, Any]:
+        return state.weights @ state.particles, 1 / jnp.sum(state.weights**2), increment
+
+    steps = blackjax_steps(
+        lambda key: initial(key, (num_particles, *job.state_shape)),
+        lambda key, x, _: transition(key, x), job.log_likelihood, kept,
+    )  # fmt: skip
+
     def run(key: Any) -> tuple[Any, Any, Any]:
+        means, sizes, increments = steps(key, observations)
+        return means, sizes, jnp.sum(increments)
+
+    return run
+
+
+def blackjax_steps(
+    initial: Callable[[Any], Any],
+    transition: Callable[[Any, Any, Any], Any],
+    log_likelihood: Callable[[Any, Any], Any],
+    kept: Callable[[Any, Any], Any],
+) -> Callable[[Any, Any], Any]:
+    """`smc.base.step` in a scan, as its docstring says: M_t, G_t and R_t of Feynman-Kac.
+
+    A function of a key and a series: what is `kept` of each step, of the state and the increment
+    of log Ẑ. `transition` and `log_likelihood` are given the series' row. blackjax hands
+    `update_fn` a key for each particle. One of them draws for all, which is faster.
+    """
+    import jax
+    from blackjax.smc import base, resampling
+
+    def run(key: Any, series: Any) -> Any:
         initial_key, steps_key = jax.random.split(key)
-        states = initial(initial_key, (num_particles, *job.state_shape))
 
         def advance(state: Any, inputs: tuple[Any, Any]) -> tuple[Any, Any]:
-            step_key, observation = inputs
+            step_key, now = inputs
             new: Any
             new, info = base.step(
                 step_key,
                 state,
-                update_fn=lambda keys, x, _: (transition(keys[0], x), None),
-                weight_fn=lambda x: job.log_likelihood(observation, x),
+                update_fn=lambda keys, x, _: (transition(keys[0], x, now), None),
+                weight_fn=lambda x: log_likelihood(now, x),
                 resample_fn=resampling.systematic,
             )
-            size = 1 / jnp.sum(new.weights**2)
-            return new, (new.weights @ new.particles, size, info.log_likelihood_increment)
+            return new, kept(new, info.log_likelihood_increment)
 
-        keys = jax.random.split(steps_key, job.num_steps)
-        _, (means, sizes, increments) = jax.lax.scan(
-            advance, base.init(states, {}), (keys, observations)
-        )
-        return means, sizes, jnp.sum(increments)
+        keys = jax.random.split(steps_key, len(jax.tree.leaves(series)[0]))
+        return jax.lax.scan(advance, base.init(initial(initial_key), {}), (keys, series))[1]
 
     return run
 

@@ -1,10 +1,9 @@
-"""A library at work in a process of its own: its peak memory is its own, a device count can be
-chosen, and what breaks one library leaves the others alone. Without JAX, unless a library needs it.
+"""A library at work in a process of its own: its peak memory is its own, and what breaks it leaves
+the others alone.
 """
 
 import multiprocessing
 import os
-import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -12,13 +11,13 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.peers import libraries
 from benchmarks.peers.jobs import JOBS
+from mpfjax.console import peak_memory
 
 
 @contextmanager
@@ -37,15 +36,13 @@ def _silent() -> None:
 
 
 @cache
-def begun(library: str, job: str, num_devices: int) -> dict[str, Any]:
+def begun(library: str, job: str) -> dict[str, Any]:
     """Version, devices and memory, once all is imported that jobs are not charged for."""
     name = library.partition("_")[0]
     told: dict[str, Any] = {"version": metadata.version(name)}
     if name != "particles":
         import jax
 
-        if name == "mpfjax":
-            jax.config.update("jax_num_cpu_devices", num_devices)
         told["devices"] = [device.device_kind for device in jax.devices()]
     libraries.prepare(library, JOBS[job], 2, 2)
     return told | {"memory": peak_memory()}
@@ -55,10 +52,10 @@ _prepare = cache(libraries.prepare)
 
 
 def run_once(
-    library: str, job: str, num_devices: int, num_particles: int, num_seeds: int, seed: int
+    library: str, job: str, num_particles: int, num_seeds: int, seed: int
 ) -> dict[str, Any]:
-    """Seconds of one run of the job, bytes above the imports', and what came out for each seed."""
-    told = begun(library, job, num_devices)
+    """Seconds of one run of the job, MB above the imports', and what came out for each seed."""
+    told = begun(library, job)
     prepared = _prepare(library, JOBS[job], num_particles, num_seeds)
     given = prepared.make_input(seed)
     start = time.perf_counter()
@@ -71,18 +68,3 @@ def run_once(
         "log_likelihoods": log_likelihoods,
         "effective_sample_sizes": sizes.mean(axis=1),
     }
-
-
-def peak_memory() -> int:
-    """The most bytes that this process has held, without importing mpfjax for it.
-
-    Linux's `ru_maxrss` goes on from the parent's at a fork; VmHWM starts anew with the program.
-    """
-    try:
-        status = Path("/proc/self/status").read_text()
-        return 1024 * int(status.split("VmHWM:")[1].split()[0])
-    except (OSError, IndexError):
-        import resource
-
-        unit = 1 if sys.platform == "darwin" else 1024
-        return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -19,3 +19,15 @@ def boxes_over_time(
         if int(id) in ids and 0 <= int(frame) - first < num_frames:
             boxes[int(frame) - first, list(ids).index(int(id))] = box
     return boxes
+
+
+def cover(
+    box: Float[np.ndarray, "frames 4"], others: Float[np.ndarray, "frames objects 4"]
+) -> Float[np.ndarray, "frames objects"]:
+    """The share of a box that each other box before it covers, 0 where one is missing."""
+    box = box[:, None]
+    low = np.maximum(box[..., :2], others[..., :2])
+    high = np.minimum(box[..., :2] + box[..., 2:], others[..., :2] + others[..., 2:])
+    share = np.clip(high - low, 0, None).prod(axis=-1) / box[..., 2:].prod(axis=-1)
+    is_before = others[..., 1] + others[..., 3] > box[..., 1] + box[..., 3]
+    return np.where(is_before & np.isfinite(share), share, 0.0)

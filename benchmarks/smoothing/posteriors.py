@@ -1,4 +1,4 @@
-"""(c) The posterior of σ_x and σ_y by three samplers, beside that of the grid filter."""
+"""The posterior of σ_x and σ_y by three samplers, beside that of the grid filter."""
 
 import time
 from functools import partial
@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 
 import mpfjax
 from benchmarks import figures as plotting
-from benchmarks.smoothing.jobs import Quadratic
+from benchmarks.peers.jobs import Quadratic
+from benchmarks.peers.libraries import model_of
 from mpfjax import tuning
 from mpfjax.exact import grid_filter
 
@@ -51,7 +52,7 @@ def sample_prior(key: Any) -> dict[str, Any]:
 
 def exact(job: Quadratic) -> dict[str, np.ndarray]:
     """The marginal density of each parameter on `AXIS`, by the grid filter."""
-    states, observations = jnp.linspace(*STATES), jnp.asarray(job.seen)
+    states, observations = jnp.linspace(*STATES), jnp.asarray(job.observations)
 
     @jax.jit
     def log_joint(pair: Any) -> Any:
@@ -70,11 +71,11 @@ def exact(job: Quadratic) -> dict[str, np.ndarray]:
 
 def measure(job: Quadratic, num_particles: int, num_steps: int, seed: int) -> Draws:
     """Each sampler on the same filter, from the same start."""
-    model: Any = job.model(independent=True)
+    model: Any = model_of(job)
     filter = mpfjax.mixture_particle_filter(
         model, num_particles, 2, proposal=mpfjax.GaussNewtonProposal(model)
     )
-    observations = job.seen
+    observations = job.observations
     chosen: dict[str, Any] = {
         "parameters": {
             "sigma_x": lambda filter: filter.model.sigma_x,

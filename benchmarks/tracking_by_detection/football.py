@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from benchmarks.scenes import cover
 from benchmarks.scenes.football import Scene, football_scene
 
 FRAMES_PER_SECOND = 12.0
@@ -50,7 +51,8 @@ def detect(match: Match, truth: np.ndarray, seed: int) -> np.ndarray:
     rows = []
     for frame in np.unique(truth[:, 0]):
         boxes = truth[truth[:, 0] == frame, 2:]
-        found = boxes[(rng.random(len(boxes)) >= MISSES) & (_hidden(boxes) <= HIDDEN)]
+        hidden = cover(boxes, np.broadcast_to(boxes, (len(boxes), *boxes.shape))).max(axis=1)
+        found = boxes[(rng.random(len(boxes)) >= MISSES) & (hidden <= HIDDEN)]
         found = found + rng.normal(0, ERROR, found.shape) * np.tile(found[:, 2:], 2)
         number = rng.poisson(FALSE_ONES)
         size = boxes[rng.integers(len(boxes), size=number), 2:]
@@ -59,11 +61,3 @@ def detect(match: Match, truth: np.ndarray, seed: int) -> np.ndarray:
         scores = np.concatenate([rng.beta(8, 2, len(found)), rng.beta(4, 4, number)])
         rows.append(np.column_stack([np.full(len(both), frame), -np.ones(len(both)), both, scores]))
     return np.concatenate(rows)
-
-
-def _hidden(boxes: np.ndarray) -> np.ndarray:
-    """The largest share of each box that one who stands nearer, lower in the picture, covers."""
-    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
-    sides = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
-    shares = np.prod(np.maximum(sides, 0), axis=2) / np.prod(boxes[:, 2:], axis=1)[:, None]
-    return np.where(high[None, :, 1] > high[:, None, 1], shares, 0).max(axis=1, initial=0)

@@ -9,36 +9,16 @@ from jax.test_util import check_grads
 
 from benchmarks.coverage import coverage, covers
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel, soft_histograms
+from benchmarks.localisation.filters import AdaptiveMonteCarlo
 from benchmarks.masses.scenes import SCENES
 from benchmarks.partitioned_sampling.posterior import distance_maps
-from benchmarks.smoothing.jobs import Linear, Quadratic
 from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.colour.bins import RGBColours
 from mpfjax.vision.colour.histograms import integral_histogram
 from tests.marking import exactness
 from tests.precision import float64
-from tests.smoothing.exact_smoothers import gaussian_smoother, grid_smoother
 
 NOISE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
-
-
-def test_smoothed_truths_are_those_of_one_large_gaussian_and_of_another_grid():
-    job = Linear(6, 1)
-    model = type("Model", (), {
-        "A": [[job.a]], "Q": [[job.q**2]], "H": [[1.0]], "R": [[job.r**2]], "m0": [0.0],
-        "P0": [[job.p**2]],
-    })  # fmt: skip
-    means, covariance = gaussian_smoother(model, job.observations[:, None])
-    x = means[:, 0]
-    expected = np.mean(np.diagonal(covariance, 1) + x[:-1] * x[1:])
-    assert job.exact == pytest.approx(expected, rel=1e-5)
-    job, grid = Quadratic(6, 1), np.linspace(-4, 4, 701)
-    log_initial = np.where(np.abs(grid) <= job.high, 0.0, -np.inf)
-    log_transition = -0.5 * ((grid[None] - grid[:, None]) / job.sigma_x) ** 2
-    log_likelihoods = -0.5 * ((job.observations[:, None] - grid**2) / job.sigma_y) ** 2
-    _, pairs = grid_smoother(log_initial, log_transition, log_likelihoods)
-    expected = np.mean(np.einsum("sij,i,j->s", pairs, grid, grid))
-    assert job.exact == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -58,6 +38,22 @@ def test_noise_and_draws_have_one_law(name):
         error = np.sqrt((one.var(axis=0) + other.var(axis=0)) / n)
         assert (np.abs(one.mean(axis=0) - other.mean(axis=0)) <= 4 * error + 1e-9).all()
         np.testing.assert_allclose(one.std(axis=0), other.std(axis=0), rtol=0.05, atol=1e-9)
+
+
+@pytest.mark.parametrize("spread", [0.1, 1.0, 10.0])
+def test_amcl_draws_one_by_one_until_there_are_enough_for_the_bins(spread):
+    """Beside the loop of Fox (2003), table 1, with the least and the most of ROS."""
+    move, occupied, number = AdaptiveMonteCarlo(None), set(), 5000
+    drawn = spread * np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32)
+    for k, pose in enumerate(np.floor(drawn / np.array(move.bins, np.float32)), 1):
+        occupied.add(tuple(pose))
+        more = max(len(occupied) - 1, 1)
+        ratio = 2 / (9 * more)
+        enough = more / (2 * 0.05) * (1 - ratio + np.sqrt(ratio) * 0.99) ** 3
+        if len(occupied) > 1 and k > min(max(enough, 2000), 5000):
+            number = k
+            break
+    assert int(move.number(jnp.asarray(drawn))) == number
 
 
 def test_maps_are_counted_pixel_by_pixel():

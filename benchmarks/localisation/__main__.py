@@ -1,0 +1,147 @@
+"""A robot that is lost in a map, and one that is carried away: who finds the true pose.
+
+    python -m benchmarks.localisation                       # all scenes that are there
+    python -m benchmarks.localisation --scenes office ring --particles 1000
+
+Scenes are the buildings and the map of the folder that MPFJAX_DATA names, or ../shared/data, where
+they are there (each file of logs/, and turtlebot), a drawn office of nine rooms that are equal
+until a pillar is seen at the end, and a ring of 24 doors. Each has four drives. A robot knows
+nothing of its pose at first; when a drive has ended it is carried away without notice, and goes on
+with the next one.
+
+A run is right where more than half of the distribution lies near the true pose: within .6 m, in a
+building 1 m, and .4 rad. `right` is the share of runs that are right at the end of the first drive,
+`found again` those at the end of the second, `steps` the median of the steps until a run is right
+after it was carried away, of those that ever are, and `sd of log Ẑ` that of the first drive,
+between runs of the same drive. All filters have --particles, but AMCL, which has 2000 to 5000.
+
+Into --out DIR go localisation.json and recovery.png.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import figures as plotting
+from benchmarks import harness
+from benchmarks.harness import AtLeast2, Seed, command
+from benchmarks.localisation.filters import NAMES, run
+from benchmarks.localisation.scenes import SCENES, Stretch
+
+TABLES = {
+    "right at the end": "{right:.2f} ± {right_error:.2f}",
+    "sd of log Ẑ": "{log_z_sd:.1f} ± {log_z_sd_error:.1f}",
+    "found again, after steps": "{found:.2f} ± {found_error:.2f}, {steps:.0f}",
+}
+
+
+QUICK = ["replacing 1%", "AMCL", "mixture, with_restarts"]
+
+
+@command(scenes=["ring"], filters=QUICK, seeds=2, particles=100, components=4, steps=5)
+def main(
+    *,
+    scenes: Sequence[Annotated[str, (*SCENES,)]] = (*SCENES,),
+    filters: Sequence[Annotated[str, (*NAMES,)]] = (*NAMES,),
+    particles: AtLeast2 = 2000,
+    components: AtLeast2 = 16,
+    seeds: AtLeast2 = 8,
+    steps: AtLeast2 | None = None,
+    seed: Seed = 0,
+    out: Path = Path("results/localisation"),
+) -> None:
+    """Scene by scene; what is finished is written.
+
+    - `components`: M, of the mixtures.
+    - `seeds`: runs of each of the four drives.
+    - `steps`: of a drive; each scene has its own.
+    - `seed`: of the drives and of the runs.
+    """
+    settings, rows = harness.settings_of(locals()), []
+    for name in scenes:
+        model, drives = SCENES[name](seed, steps)
+        for filter in filters:
+            found = [
+                follow(model, filter, pair, particles, components, seeds, 4 * seed + number)
+                for number, pair in enumerate(zip(drives, drives[1:] + drives[:1], strict=True))
+            ]
+            rows.append({"scene": name, "filter": filter, **summary(found, len(drives[0].poses))})
+            harness.data(out / "localisation.json", settings=settings, rows=rows)
+            print(f"{name}, {filter}: {TABLES['right at the end'].format(**rows[-1])}")
+        # Programs keep memory maps, of which a process has 65 530, and no other scene needs these.
+        jax.clear_caches()
+    for title, cell in TABLES.items():
+        print(f"\n{harness.pivot(title, rows, '{filter}', '{scene}', cell)}")
+    harness.figures(out, recovery=picture(rows))
+    print(f"written to {out}")
+
+
+class Found(NamedTuple):
+    """Of each run: whether it is right at each step, and log Ẑ of the first drive."""
+
+    right: np.ndarray  # (runs, t)
+    log_z: np.ndarray
+
+
+def follow(
+    model: Any, filter: str, drives: tuple[Stretch, Stretch], size: int, components: int,
+    seeds: int, seed: int,
+) -> Found:  # fmt: skip
+    """Runs of a filter on a drive, after which the robot is carried to the start of another."""
+    both = map(np.concatenate, zip(*drives, strict=True))
+    motion, deviations, poses, seen = (jnp.asarray(part, jnp.float32) for part in both)
+    keys, given = jax.random.split(jax.random.key(seed), seeds), (seen, (motion, deviations))
+    particles, logs, increments = run(filter, model, size, components, keys, given)
+    away = particles - poses[None, :, None]
+    turned = jnp.abs((away[..., 2] + jnp.pi) % (2 * jnp.pi) - jnp.pi)
+    near = (jnp.hypot(away[..., 0], away[..., 1]) < model.near) & (turned < 0.4)
+    right = jnp.sum(jnp.where(near, jnp.exp(logs), 0.0), axis=-1) > 0.5
+    log_z = jnp.sum(increments[:, : len(drives[0].poses)], axis=1)
+    return Found(np.asarray(right), np.asarray(log_z, float))
+
+
+def summary(found: list[Found], carried: int) -> dict[str, Any]:
+    """Over all runs, with standard errors; `by_step` is the share of runs that are right."""
+    right = np.concatenate([each.right for each in found]).astype(float)
+    deviations = np.array([each.log_z.std(ddof=1) for each in found])
+    runs, deviation = len(right), float(np.sqrt(np.mean(deviations**2)))
+    by_step = right.mean(axis=0)
+    errors = np.sqrt(by_step * (1 - by_step) / runs)
+    after = right[:, carried:] > 0
+    ever = after.any(axis=1)
+    return {
+        "runs": runs, "carried": carried, "by_step": by_step, "errors": errors,
+        "right": by_step[carried - 1], "right_error": errors[carried - 1],
+        "found": by_step[-1], "found_error": errors[-1],
+        "steps": float(np.median(1 + after[ever].argmax(axis=1))) if ever.any() else None,
+        "log_z_sd": deviation, "log_z_sd_error": deviation / np.sqrt(2 * (runs - len(found))),
+    }  # fmt: skip
+
+
+def picture(rows: list[dict[str, Any]]) -> Any:
+    """A panel for each scene: the share of runs at the true pose by step, ± its standard error."""
+
+    def panel(name: str) -> plotting.Panel:
+        lines, carried = {}, None
+        for row in rows:
+            if row["scene"] == name:
+                share, error, carried = row["by_step"], row["errors"], row["carried"]
+                steps = np.arange(1, len(share) + 1)
+                points = zip(steps, share, share - error, share + error, strict=True)
+                lines[row["filter"]] = [*points]
+        title = f"{name}; carried away after {carried} scans"
+        share = "share of runs at the true pose"
+        return plotting.Panel(title, "time (scans)", share, lines, (-0.03, 1.03), carried)
+
+    panels = [panel(name) for name in dict.fromkeys(row["scene"] for row in rows)]
+    across = 2 if len(panels) == 4 else 3
+    shown = [panels[start : start + across] for start in range(0, len(panels), across)]
+    return plotting.draw_panels(shown, ("linear", "linear"))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,147 @@
+"""What is compared: plain filters, AMCL, a peer, the mixture, and the mixture with restarts."""
+
+import importlib.util
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+import mpfjax
+from benchmarks.peers.libraries import blackjax_steps
+
+PEER = "blackjax, bootstrap filter"
+
+
+class AdaptiveMonteCarlo(mpfjax.AbstractMove):
+    """A step of AMCL (Fox 2003; Thrun, Burgard and Fox 2005, table 8.3) as ROS has it.
+
+    Particles are drawn one by one, until the bound on the Kullback-Leibler divergence holds for the
+    bins that they occupy. Each is a new draw of x_0 with probability max(0, 1 - w_fast / w_slow),
+    from running averages of the likelihood. The settings are those that its documentation advises.
+    """
+
+    model: Any
+
+    approximate = True
+    propagates = True
+    resamples = True
+    keeps_parents = False
+    least, error, z = 2000, 0.05, 0.99  # the most is the filter's N
+    slow, fast = 0.001, 0.1
+    bins = (0.5, 0.5, np.pi / 18)
+
+    def initial_memory(self, num_components: int) -> dict[str, Any]:
+        """The logarithms of w_slow and w_fast."""
+        del num_components
+        return {"averages": jnp.full(2, -jnp.inf)}
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, observation: Any
+    ) -> mpfjax.ParticleMixture:
+        """Draw, move, and weigh."""
+        keys, most = jax.random.split(key, 5), mixture.num_particles
+        slow, fast = mixture.memory["averages"]
+        anew = jnp.maximum(0.0, -jnp.expm1(jnp.where(slow > -jnp.inf, fast - slow, 0.0)))
+        upto = jnp.cumsum(mixture.weights)
+        points = upto[-1] * jax.random.uniform(keys[0], (most,))
+        chosen = mixture.particles[jnp.clip(jnp.searchsorted(upto, points), 0, most - 1)]
+        is_new = jax.random.uniform(keys[1], (most, 1)) < anew
+        drawn = jnp.where(is_new, self.model.sample_initial(keys[2], most), chosen)
+        number = self.number(drawn)
+        moved = self.model.sample_transition(keys[3], drawn)
+        logs = self.model.log_likelihood(observation, moved) - jnp.log(number)
+        logs = jnp.where(jnp.arange(most) < number, logs, -jnp.inf)
+        now = jax.nn.logsumexp(logs)
+        # A step with new draws forgets both averages.
+        averages = [
+            jnp.where(
+                (before > -jnp.inf) & (anew == 0),
+                jnp.logaddexp(jnp.log1p(-rate) + before, jnp.log(rate) + now),
+                now,
+            )
+            for before, rate in ((slow, self.slow), (fast, self.fast))
+        ]
+        return mixture.replace(
+            particles=moved, log_weights=logs, ancestor_indices=jnp.full(most, -1, jnp.int32),
+            memory=mixture.memory | {"averages": jnp.stack(averages)},
+        )  # fmt: skip
+
+    def number(self, drawn: Float[Array, "n 3"]) -> Int[Array, ""]:
+        """How many are drawn before there are enough for the bins that they occupy."""
+        most = len(drawn)
+        cells = jnp.floor(drawn / jnp.array([self.bins])).astype(jnp.int32)
+        order = jnp.lexsort([cells[:, 0], cells[:, 1], cells[:, 2]])
+        ordered = cells[order]
+        is_first = jnp.any(ordered != jnp.roll(ordered, 1, axis=0), axis=1).at[0].set(True)
+        occupied = jnp.cumsum(jnp.zeros(most, jnp.int32).at[order].set(is_first.astype(jnp.int32)))
+        more = jnp.maximum(occupied - 1, 1).astype(jnp.float32)
+        ratio = 2 / (9 * more)
+        enough = more / (2 * self.error) * (1 - ratio + jnp.sqrt(ratio) * self.z) ** 3
+        enough = jnp.where(occupied > 1, jnp.clip(enough, self.least, most), most)
+        is_enough = jnp.arange(1.0, most + 1) > enough
+        return jnp.where(jnp.any(is_enough), jnp.argmax(is_enough) + 1, most).astype(jnp.int32)
+
+
+def replace_some(
+    model: Any, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, observation: Any
+) -> mpfjax.ParticleMixture:
+    """One in a hundred particles is drawn from x_0's law."""
+    del observation
+    keys, size = jax.random.split(key), mixture.num_particles
+    is_new = jax.random.uniform(keys[0], (size, 1)) < 0.01
+    drawn = model.sample_initial(keys[1], size)
+    return mixture.replace(particles=jnp.where(is_new, drawn, mixture.particles))
+
+
+def features(states: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
+    """By which hypotheses are told apart."""
+    return jnp.stack([*states[:, :2].T, jnp.cos(states[:, 2]), jnp.sin(states[:, 2])], axis=1)
+
+
+def mixture(model: Any, num_particles: int, max_components: int) -> mpfjax.Filter:
+    """By default."""
+    return mpfjax.mixture_particle_filter(
+        model, num_particles, max_components, features=features, scale=(1.0, 1.0, 0.5, 0.5)
+    )
+
+
+FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
+    "particle filter": lambda model, n, m: mpfjax.particle_filter(model, n, ess_threshold=0.5),
+    "replacing 1%": lambda model, n, m: mpfjax.Filter(
+        model, [mpfjax.Resample(), partial(replace_some, model), mpfjax.Propagate(model)], n
+    ),
+    "AMCL": lambda model, n, m: mpfjax.Filter(model, [AdaptiveMonteCarlo(model)], 5000),
+    "mixture": mixture,
+    "mixture, with_restarts": lambda model, n, m: mpfjax.with_restarts(mixture(model, n, m), 1e-3),
+}
+NAMES = [*FILTERS, *([PEER] if importlib.util.find_spec("blackjax") else [])]
+
+
+def traced(mixture: mpfjax.ParticleMixture) -> tuple[Array, Array]:
+    """What is kept of a step."""
+    return mixture.particles, mixture.log_weights
+
+
+def run(name: str, model: Any, size: int, components: int, keys: Array, given: Any) -> Any:
+    """Of each run and step on (observations, inputs): particles, log-weights, log Ẑ's increment."""
+    observations, inputs = given
+    if name == PEER:
+        return _through_blackjax(model, size)(keys, given)
+    filter = FILTERS[name](model, size, components)
+    runs = mpfjax.monte_carlo(keys, filter, observations, traced, inputs=inputs)
+    return *runs.collected, runs.log_likelihood_increments
+
+
+def _through_blackjax(model: Any, size: int) -> Callable[..., Any]:
+    """A row of the series is (observation, inputs)."""
+    one = blackjax_steps(
+        lambda key: model.sample_initial(key, size),
+        lambda key, x, row: model.with_inputs(row[1]).sample_transition(key, x),
+        lambda row, x: model.log_likelihood(row[0], x),
+        lambda state, increment: (state.particles, jnp.log(state.weights), increment),
+    )
+    return jax.jit(jax.vmap(one, in_axes=(0, None)))
