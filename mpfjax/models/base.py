@@ -164,32 +164,27 @@ def _innermost(model: Any) -> Any:
     return model if inner is model else _innermost(inner)
 
 
-def require_model(model: Any, argument: str) -> None:
-    """Raise a `ValueError` for anything but a model, and for one written for a single particle."""
-    law, needed_by = "sample_transition", "a filter"
-    if getattr(type(model), law, None) is _FROM_NOISE and not hasattr(model, "latent_dynamics"):
-        law, needed_by = "transition_from_noise", "a model without sample_transition"
-    for method in ("sample_initial", law, "log_likelihood"):
-        require(model, method, needed_by, argument)
-    try:
-        inspect.signature(model.sample_initial).bind("key", "num_particles")
-    except TypeError as error:
-        raise ValueError(
-            f"{argument}: {model_name(model)}.sample_initial takes no (key, num_particles); if it"
-            " is of one particle, wrap it, mpfjax.per_particle(model)"
-        ) from error
-
-
 class _ModelRule(Rule):
-    """A model has the methods, whether it is an `AbstractStateSpaceModel` or not."""
+    """A model has the methods, of all particles at once, whatever its class is."""
 
     def check(self, value: Any, name: str) -> None:
-        require_model(value, name)
+        """Raise a `ValueError` that says what is missing."""
+        law, needed_by = "sample_transition", "a filter"
+        if getattr(type(value), law, None) is _FROM_NOISE and not hasattr(value, "latent_dynamics"):
+            law, needed_by = "transition_from_noise", "a model without sample_transition"
+        for method in ("sample_initial", law, "log_likelihood"):
+            require(value, method, needed_by, name)
+        try:
+            inspect.signature(value.sample_initial).bind("key", "num_particles")
+        except TypeError as error:
+            raise ValueError(
+                f"{name}: {model_name(value)}.sample_initial takes no (key, num_particles); if it"
+                " is of one particle, wrap it, mpfjax.per_particle(model)"
+            ) from error
 
 
-RULES[AbstractStateSpaceModel] = _ModelRule(
-    lambda model: hasattr(model, "log_likelihood"), "a model"
-)
+_IS_MODEL = _ModelRule(lambda value: hasattr(value, "log_likelihood"), "a model")
+RULES[AbstractStateSpaceModel] = _IS_MODEL
 
 
 def check_states(states: Any, model: Any, method: str, num_particles: int) -> None:
