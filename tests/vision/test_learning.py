@@ -116,15 +116,10 @@ def test_the_mean_product_of_innovations_is_the_cameras_variance(sigma, num_obje
     predicted = Gaussian(rows, 0 * rows, small, small, small)
     cost = jnp.where(jnp.eye(num_objects, dtype=bool), -1.0, 1.0)
     camera = jax.tree.map(jnp.asarray, CameraState.initial())
+    known, gone = jnp.asarray(False), jnp.zeros((1, 2))
     step = jax.jit(
         lambda camera, seen: camera.after(
-            predicted,
-            jnp.zeros((1, 2)),
-            jnp.asarray(False),
-            cost,
-            jnp.full(4, 0.1),
-            seen,
-            jnp.ones(2),
+            predicted, gone, known, cost, jnp.full(4, 0.1), seen, jnp.ones(2)
         )
     )
     kept = []
