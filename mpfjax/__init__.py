@@ -38,6 +38,7 @@ from mpfjax.moves.base import AbstractPropagation as AbstractPropagation
 from mpfjax.moves.base import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves.base import AbstractResampling as AbstractResampling
 from mpfjax.moves.every import Every as Every
+from mpfjax.moves.initial import SelectInitial as SelectInitial
 from mpfjax.moves.metropolis import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
 from mpfjax.moves.metropolis import RandomWalkMetropolis as RandomWalkMetropolis
 from mpfjax.moves.objects.partitioned import Partitioned as Partitioned

@@ -32,13 +32,15 @@ def read_frames(
     `path` is a video file, a folder of images in the natural order of their names (2.png before
     10.png), or a folder with such a folder `img` or `img1`. All frames of a video are read,
     whatever the time between them, rotated as the file says. A `RuntimeWarning` names those that
-    are too damaged to be decoded. Raises `ImportError` if PyAV is missing for a video, and
-    `ValueError` with `path` if it cannot be read, has no frames, or has frames of different sizes,
-    and for `first` and `last` that are no range.
+    are too damaged to be decoded. Raises `ImportError` if PyAV is missing for a video,
+    `FileNotFoundError` where there is nothing, and `ValueError` with `path` if it cannot be read,
+    has no frames, or has frames of different sizes, and for `first` and `last` that are no range.
     """
     if last is not None and last < first:
         raise ValueError(f"first, last: {first}, {last} is not a range of frames from 1 on")
     path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"path: {path} does not exist")
     frames = _read_images(path, first, last) if path.is_dir() else _read_video(path, first, last)
     return of_one_kind(frames, first, str(path))
 
