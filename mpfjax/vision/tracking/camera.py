@@ -93,9 +93,10 @@ def jolted(
     """The shift of a jolt that leaves most objects without a detection, zero if there was none.
 
     `unlike` is infinite where the two are no pair, and `seen` is 0 for what was not seen lately.
-    Where fewer than half of the objects have a detection near them, the shifts that bring one of
-    the eight longest seen to one of the two detections next to it are tried: a camera moves all by
-    the same. The one that explains most counts, if that is half of them and two more than before.
+    Where at most half of the objects have a detection near them, the shifts that bring one of the
+    eight longest seen to one of the two detections next to it are tried: a camera moves all by the
+    same. The one that explains most counts, if that is three quarters of them, and two more than
+    without it.
     """
     number = jnp.sum(seen > 0, dtype=jnp.int32)
 
