@@ -155,3 +155,13 @@ def test_impossible_and_empty_particles():
     assert np.all(np.isfinite(found))
     assert found[0] > 1 > found[1] >= 0.25
     np.testing.assert_array_equal(trusted(jnp.full((2, 3), -jnp.inf), jnp.ones(3)), 1.0)
+
+
+def test_draws_that_stand_in_line_are_kept_without_favour(monkeypatch):
+    """x_0 of the quadratic model are stratified and ascend; y_1 tells nothing of their sign."""
+    monkeypatch.setattr(initial, "MANY_DRAWS", 2**11)
+    filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0), 48, 2)
+    start = jax.jit(jax.vmap(lambda key: filter.init(key, jnp.float32(1.2))))
+    found = start(jax.random.split(KEY, 300))
+    means = jax.vmap(lambda mixture: mixture.mean())(found)
+    assert_unbiased(np.exp(found.log_scale) * np.asarray(means), 0.0)

@@ -157,7 +157,13 @@ class SelectInitial(AbstractMove):
             old_weights = number * exp(before.mixture.log_weights + before.mixture.log_scale)
             mixture, old_factors, *origins = before
             old = (mixture.particles, old_factors.T, old_weights, *origins)
-            put = lambda new, old: new.at[:n].set(jnp.where(t > 0, old, new[:n]))  # noqa: E731
+            # One of every K gives way, any of them: a model's draws may stand in line.
+            j = jax.random.randint(jax.random.fold_in(key, 3), (), 0, k)
+
+            def put(new: Array, old: Array) -> Array:
+                rows = new.reshape(n, k, *new.shape[1:])
+                return rows.at[:, j].set(jnp.where(t > 0, old, rows[:, j])).reshape(new.shape)
+
             pool = jax.tree.map(put, pool, old)
         drawn, log_factors, weights, *origins = pool
         log_factors = log_factors.T
