@@ -131,9 +131,8 @@ class Filter(eqx.Module):
             draw = self._sample_initial
             particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
         mixture = single_component(particles, self.num_components)
-        memory = initial_memory(self.moves, self.num_components)
-        if self._reads_increment:
-            memory[INCREMENT] = jnp.zeros((), mixture.log_weights.dtype)
+        increment = {INCREMENT: jnp.zeros_like(mixture.log_scale)} if self._reads_increment else {}
+        memory = initial_memory(self.moves, self.num_components) | increment
         mixture = mixture.replace(memory=memory)
         for move_key, move in zip(keys, self.initial_moves, strict=True):
             mixture = move(move_key, mixture, observation)

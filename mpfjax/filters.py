@@ -304,11 +304,10 @@ def _seen(
 ) -> dict[str, Any]:
     """What the grouping moves see: by default the state, on circles where the model has periods."""
     periods = jax.tree.leaves(getattr(model, "periods", None))
-    if features is None and periods:
-        features = OnCircles(tuple(np.concatenate([*map(np.ravel, periods)]).tolist()))
-    else:
-        features = mapped(model, features)
-    return {"features": features, "scale": scale}
+    if features is not None or not periods:
+        return {"features": mapped(model, features), "scale": scale}
+    flat = np.concatenate([*map(np.ravel, periods)])
+    return {"features": OnCircles(tuple(flat.tolist())), "scale": scale}
 
 
 def _mixture(

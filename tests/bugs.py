@@ -257,6 +257,18 @@ BUGS = {
         "return objects[0]",
         "tests/moves/test_partitioned.py -k moved_last",
     ),
+    "many rounds of draws of x_0 count as one": Bug(
+        "moves/initial.py",
+        "number = (k + (k - 1) * jnp.asarray(t, weights.dtype)) / k",
+        "number = jnp.ones((), weights.dtype)",
+        "tests/test_initial.py -k wide",
+    ),
+    "restarts forget the mass of their choice": Bug(
+        "moves/restarts.py",
+        "log_weights = jnp.log(self.probability) + anew.log_scale + anew.log_weights",
+        "log_weights = jnp.log(self.probability) + anew.log_weights",
+        "tests/moves/test_restarts.py -k kernel",
+    ),
     "a point set is not shifted": Bug(
         "models/noise.py",
         "points = sobol_points(ranks, directions) ^ shifts",

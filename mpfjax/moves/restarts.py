@@ -84,19 +84,14 @@ class Restart(AbstractMove):
         """What the resampling would."""
         return self.resample.would_resample(mixture, observation)
 
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """The same where y_t is missing, with any draws of x_0."""
+        return self(key, mixture, None)
+
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """Resample, with draws of x_0 that y_t speaks for in the last slots."""
-        return self._mixed(key, mixture, observation)
-
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """The same where y_t is missing, with any draws of x_0."""
-        return self._mixed(key, mixture, None)
-
-    def _mixed(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
         key_resample, key_drawn, key_look, key_chosen = split(key, 4)
         n, last = mixture.num_particles, mixture.num_components - 1
         # The cumulative sum after the step before; bounded, so that it ends when they are right.
