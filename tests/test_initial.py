@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -107,6 +108,21 @@ def test_by_default_a_wide_prior_gets_many_draws(monkeypatch):
 
 
 @pytest.mark.exactness
+@pytest.mark.exactness
+def test_derivatives_are_those_of_the_draws_that_are_kept():
+    """By default those of four draws a particle; where there are many, of draws once more."""
+
+    def log_evidence(model, num_draws):
+        filter = mpfjax.with_selected_start(mpfjax.particle_filter(model, 100), num_draws)
+        return mpfjax.run_filter(KEY, filter, OBSERVATIONS[:2] / 3, nothing).log_marginal_likelihood
+
+    score = eqx.filter_jit(eqx.filter_grad(log_evidence))
+    four, default = (score(ScalarLinear(), k) for k in (4, None))
+    np.testing.assert_allclose(default.p, four.p, rtol=1e-4)
+    # The evidence falls as 1 / p.
+    np.testing.assert_allclose(score(ScalarLinear(p=3000.0), None).p, -1 / 3000, rtol=0.6)
+
+
 def test_what_a_chain_weighs_before_it_propagates_counts():
     """x_0 is seen once more, with an error of 2, by a move at the head of the chain."""
 
