@@ -145,10 +145,10 @@ class Ring(Ranges):
         return jnp.stack([60 * place, 0 * place, jnp.where(way < 0.5, 0.0, jnp.pi)], axis=1)
 
     def ranges(self, states: Float[Array, "n 3"]) -> Float[Array, "n 1"]:
-        """The doors, and a niche of twice their depth .9 m behind the one at 0."""
+        """The doors, and a niche of twice their depth 1 m behind the one at 0."""
         place = (states[:, 0] + 30) % 60 - 30
         gaps = place - 2.5 * jnp.round(place / 2.5)
-        niche = jnp.exp(-0.5 * ((place - 0.9) / 0.2) ** 2)
+        niche = jnp.exp(-0.5 * ((place - 1.0) / 0.4) ** 2)
         return (0.5 * jnp.exp(-0.5 * (gaps / 0.3) ** 2) + niche)[:, None]
 
     def log_likelihood(
@@ -279,7 +279,7 @@ def office(seed: int, steps: int | None) -> Scene:
 def ring(seed: int, steps: int | None) -> Scene:
     """A ring of doors: 48 hypotheses until the end of 40 steps."""
     model = Ring(jnp.zeros((1, 2)), jnp.zeros((1, 1), bool), 1.0, most=1.0, deviation=0.1)
-    along = 61.5 + 0.25 * np.arange(-(steps or 40), 1)
+    along = 62.5 + 0.25 * np.arange(-(steps or 40), 1)
     path = np.stack([along, 0 * along, 0 * along], axis=1)
     return drives(model, seed, lambda _: path)
 
