@@ -62,12 +62,14 @@ def test_a_notebook_runs_in_its_short_form(path, monkeypatch):
     NotebookClient(notebook, timeout=240, kernel_name="python3", resources=resources).execute()
 
 
-def test_notebooks_hold_their_outputs():
+def test_notebooks_hold_their_outputs_and_use_the_library_alone():
     for path in NOTEBOOKS:
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         outputs = [output for cell in cells for output in cell.get("outputs", ())]
         assert any("image/png" in output.get("data", {}) for output in outputs), path
         assert not any(output["output_type"] == "error" for output in outputs), path
+        code = [cell["source"] for cell in cells if cell["cell_type"] == "code"]  # lists of lines
+        assert max(map(len, code)) <= 25 and "benchmarks" not in str(code), path
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=stem)
