@@ -121,8 +121,8 @@ def with_selected_start(filter: Filter, num_draws: Count | None = None) -> Filte
     """The filter whose x_0 is chosen by y_1 among K N draws: a `SelectInitial` moves it first.
 
     `num_draws` is K; with one, x_0 is a plain draw again. None takes four draws a particle, and
-    2^17 in all where these are too few, as `mixture_particle_filter` does. The look at y_1 is that
-    of the filter's own propagation. Raises `ValueError` for K < 1, and for a filter without a
+    2^17 in all where a pilot of N shows that these are too few. The look at y_1 is that of the
+    filter's own propagation. Raises `ValueError` for K < 1, and for a filter without a
     `Propagate` or `PropagateNested`. Use it where the prior is wide beside the likelihood.
     """
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]

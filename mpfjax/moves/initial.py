@@ -67,9 +67,10 @@ class SelectInitial(AbstractMove):
     increment, and Ẑ stays unbiased. A wide prior is covered as by K N particles, at the cost of
     2 K more draws of x_1 in the whole run.
 
-    By default K is four, and there are 2^17 draws in all where the particles that it is given show
-    that four are too few: of these, y_1 leaves an effective number of less than 32, and it tells
-    more of x_0 than of the step to x_1. A pose in a building is such a state.
+    Without a K it is four, and there are 2^17 draws in all where the particles that it is given
+    show that four are too few: of these, y_1 leaves an effective number of less than 32, and it
+    tells more of x_0 than of the step to x_1. A pose in a building is such a state. For thousands
+    of short runs of few particles so many draws cost far more than the run.
 
     Without an observation it does nothing. Where an initial move weighs x_0, the chain's `Resample`
     waits for y_1: it would undo the choice.
