@@ -74,10 +74,11 @@ def as_numbers(
 
 def _array_of_numbers(name: str, value: Any, may_be_complex: bool = False) -> Any:
     """The argument as an array of its own type, of JAX where any part of it is."""
-    of_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
-    array: Any = None
-    with contextlib.suppress(TypeError, ValueError, OverflowError):
-        array = jnp.asarray(value) if of_jax else np.asarray(value)
+    array: Any = value if isinstance(value, jax.Array) else None
+    if array is None:
+        of_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            array = jnp.asarray(value) if of_jax else np.asarray(value)
     # A mask or an imaginary part would later be dropped without a word.
     is_real = may_be_complex or not np.iscomplexobj(array)
     if np.ma.is_masked(value) or not _has_numbers(array) or not is_real:

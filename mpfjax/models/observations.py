@@ -152,9 +152,9 @@ def present_steps(observations: PyTree, series: Series, takes_nan: bool) -> Any:
     """Which observations are there, (t,), or None where all are; raises for data not to be run."""
     usable, present = _usable_steps(observations, takes_nan), series.present
     numpy: Any = jnp if any(isinstance(mask, Tracer) for mask in (usable, present)) else np
-    present = numpy.ones(usable.shape, bool) if present is None else present
-    check_shape(f"{len(usable)}", present=present)
-    present = numpy.asarray(present, bool)
+    if present is not None:
+        check_shape(f"{len(usable)}", present=present)
+    present = numpy.ones(usable.shape, bool) if present is None else numpy.asarray(present, bool)
     if series.skips_missing:
         seen = usable
         if takes_nan:
