@@ -74,8 +74,9 @@ def as_numbers(
 
 def _array_of_numbers(name: str, value: Any, may_be_complex: bool = False) -> Any:
     """The argument as an array of its own type, of JAX where any part of it is."""
-    array: Any = value if isinstance(value, jax.Array) else None
-    if array is None:
+    array: Any = value
+    if not isinstance(value, jax.Array):
+        array = None
         of_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
         with contextlib.suppress(TypeError, ValueError, OverflowError):
             array = jnp.asarray(value) if of_jax else np.asarray(value)

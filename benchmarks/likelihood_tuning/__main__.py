@@ -103,7 +103,7 @@ def quadratic_task() -> Task:
     return build_quadratic, jnp.asarray(OBSERVATIONS), jnp.asarray(point, jnp.float32), exact
 
 
-def build_filter(name: str, model: Any, num_particles: int, estimator: str) -> mpfjax.Filter:
+def build_filter(name: str, model: Any, num_particles: int, estimator: Any) -> mpfjax.Filter:
     """The filter of that name with that estimator."""
     if estimator != "pathwise":
         if name == "pf":

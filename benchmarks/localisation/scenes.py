@@ -198,7 +198,7 @@ def building(name: str, seed: int, steps: int | None) -> Scene:
 
 def with_table(wall: np.ndarray, known: np.ndarray, cell: float, **options: Any) -> Ranges:
     """The model of a map. It may start where no wall is within .12 m."""
-    field = distance_transform_edt(~wall) * cell
+    field = cell * np.asarray(distance_transform_edt(~wall))
     rows, columns = np.nonzero(known & (field > 0.12))
     free = jnp.asarray(cell * (np.stack([columns, rows], axis=1) + 0.5), jnp.float32)
     model = Ranges(free, jnp.asarray(known), cell, **options)
