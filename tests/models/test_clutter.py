@@ -90,7 +90,10 @@ def test_the_gradient_is_that_of_all_associations():
 
     log_z, gradients = values(jax.random.split(KEY, 300))
     h = 1e-4
-    at = lambda p, log_clutter: by_associations(SETS, p, np.exp(log_clutter))[0]  # noqa: E731
+
+    def at(p, log_clutter):
+        return by_associations(SETS, p, np.exp(log_clutter))[0]
+
     log_clutter = np.log(CLUTTER)
     exact = [
         (at(P_D + h, log_clutter) - at(P_D - h, log_clutter)) / (2 * h),

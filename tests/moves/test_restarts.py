@@ -125,7 +125,10 @@ class Watching(mpfjax.AbstractMove):
 def test_moves_and_collect_see_the_increment_the_time_and_the_inputs():
     plain = FILTERS["particle filter"]
     filter = plain.replace(moves=[*plain.moves, Watching()])
-    collect = lambda mixture, t, inputs: (mixture.memory["seen"], t, inputs)  # noqa: E731
+
+    def collect(mixture, t, inputs):
+        return mixture.memory["seen"], t, inputs
+
     run = mpfjax.run_filter(jax.random.key(0), filter, OBSERVATIONS[:5], collect)
     seen, times, inputs = run.collected
     np.testing.assert_array_equal(seen, run.log_likelihood_increments)

@@ -29,7 +29,10 @@ def test_one_step_at_a_time_is_the_whole_series(method):
     """From the same start by the same keys: the term at t - L, and at the end those left."""
     lag, key, terms = 2, jax.random.key(3), []
     filter = mpfjax.mixture_particle_filter(QUADRATIC, 50, 2)
-    function = lambda before, after: {"x": after, "up": before < after}  # noqa: E731
+
+    def function(before, after):
+        return {"x": after, "up": before < after}
+
     whole = smoothed_sums(key, filter, SQUARES, function, lag=lag, method=method)
     smoother = FixedLagSmoother(filter, function, lag, method)
     window = smoother.init(whole.run.initial)
