@@ -1,7 +1,10 @@
 """The extension of Sphinx for this site: docstrings, links from code to the API, MathML."""
 
 import importlib
+import inspect
 import re
+import types
+import typing
 from typing import Any
 
 import docstrings
@@ -12,9 +15,11 @@ from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.transforms import SphinxTransform
 from sphinx.util import logging
+from sphinx.util.inspect import stringify_signature
 from sphinx.writers.html5 import HTML5Translator
 
 LOGGER = logging.getLogger(__name__)
+_ACCENTED = re.compile(r"\\(hat|bar|tilde|dot)(\{[^{}]*\}| ?[A-Za-z])(?=_)")
 
 
 def target_of(code: str) -> str | None:
@@ -87,12 +92,28 @@ def process_docstring(
     lines[:] = docstrings.to_rst(lines)
 
 
+def forget_rules(app: Sphinx, obj: Any, bound_method: bool) -> None:
+    """Types alone are shown, without the rules that `mpfjax.checks` finds beside them."""
+    function = getattr(obj, "__func__", obj)  # of a method of the class
+    if isinstance(function, types.FunctionType):
+        hints = typing.get_type_hints(function)
+        function.__annotations__ = inspect.unwrap(function).__annotations__ = hints
+
+
 def process_signature(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, returns: str
 ) -> tuple[str | None, str | None]:
-    """Signatures with `Array`, not with the private name that JAX gives it."""
-    short = [part and re.sub(r"\bjaxlib\._jax\.", "", part) for part in (signature, returns)]
-    return short[0], short[1]
+    """Signatures in words that Python reads, and `Array` without the private name of its module."""
+    if signature and hasattr(obj, "__signature__"):  # a class of equinox, which had no event
+        forget_rules(app, obj.__init__, True)
+        signature = stringify_signature(
+            obj.__signature__, show_return_annotation=False, unqualified_typehints=True
+        )
+    shown = []
+    for part in (signature, returns):
+        part = part and re.sub(r"\bjaxlib\._jax\.", "", part)
+        shown.append(part and re.sub(r"<(?:function )?(\w+)[^<>]*>", r"\1", part))
+    return shown[0], shown[1]
 
 
 def shorten_types(app: Sphinx, doctree: nodes.document) -> None:
@@ -103,8 +124,10 @@ def shorten_types(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def _mathml(self: HTML5Translator, node: nodes.Element, as_block: bool) -> None:
+    # docutils would write the index of a letter with an accent below the letter.
+    formula = _ACCENTED.sub(r"\g<0>{}", node.astext())
     try:
-        self.body.append(tex2mathml(node.astext(), as_block=as_block))
+        self.body.append(tex2mathml(formula, as_block=as_block))
     except Exception as error:
         LOGGER.warning("no MathML of %r: %s", node.astext(), error, location=node)
     raise nodes.SkipNode
@@ -130,6 +153,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_html_math_renderer("mathml", (visit_math, None), (visit_math_block, None))
     app.add_transform(LinkCode)
     app.connect("autodoc-process-docstring", process_docstring)
+    app.connect("autodoc-before-process-signature", forget_rules)
     app.connect("autodoc-process-signature", process_signature)
     app.connect("doctree-read", shorten_types)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
