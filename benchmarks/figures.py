@@ -160,7 +160,7 @@ def draw_panels(
     """
     shared = "row" if len({panel.ylabel for panel in rows[0]}) == 1 else "col"
     num_columns = max(len(row) for row in rows)
-    figure = Figure(figsize=(3.9 * num_columns, 3.3 * len(rows) + 0.5), layout="constrained")
+    figure = Figure(figsize=(3.1 * num_columns, 2.9 * len(rows) + 0.5), layout="constrained")
     axes = figure.subplots(len(rows), num_columns, squeeze=False, sharey=shared)
     names = list(dict.fromkeys(name for row in rows for panel in row for name in panel.lines))
     for row_axes, row in zip(axes, rows, strict=True):
@@ -168,17 +168,33 @@ def draw_panels(
             axis.set_axis_off()
         for axis, panel in zip(row_axes, row, strict=False):
             _draw_panel(axis, panel, names, scales)
-    handles = {
-        label: handle
-        for axis in axes.ravel()
-        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-    }
+    found = [axis.get_legend_handles_labels() for axis in axes.flat]
+    handles = {label: handle for each in found for handle, label in zip(*each, strict=True)}
     # In inches, of a name and its marker at this size of letters: a wider legend would be cut off.
     column = 0.55 + 0.07 * max(map(len, names))
     figure.legend(
         [handles[name] for name in names], names, loc="outside upper center", fontsize=8,
         ncols=max(1, min(len(names), 2 * num_columns, int(figure.get_figwidth() / column))),
     )  # fmt: skip
+    return figure
+
+
+def draw_dots(rows: Sequence[Sequence[Panel]], width: float) -> Figure:
+    """Panels of points (name, x, low, high), where each name has a row."""
+    names = {point[0] for points in rows[0][0].lines.values() for point in points}
+    size = 1.9 + width * len(rows[0]), 0.4 + (0.9 + 0.21 * len(names)) * len(rows)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(len(rows), len(rows[0]), sharey=True, squeeze=False)
+    for axis, panel in zip(axes.flat, (panel for row in rows for panel in row), strict=True):
+        for k, (label, points) in enumerate(panel.lines.items()):
+            at, x, low, high = zip(*points, strict=True)
+            style: Any = {"fmt": MARKERS[k], "color": COLOURS[k], "ms": 4, "label": label}
+            axis.errorbar(x, at, xerr=(np.subtract(x, low), np.subtract(high, x)), **style)
+        axis.set(xlabel=panel.xlabel, xlim=panel.ylim)
+        axis.set_title(textwrap.fill(panel.title, int(11 * width)), fontsize=9)
+        axis.grid(alpha=0.25)
+    axes[0, 0].invert_yaxis()
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return figure
 
 
@@ -206,13 +222,10 @@ def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[st
         else:
             axis.plot(x, y, **style)
     axis.set(xscale=scales[0], yscale=scales[1], xlabel=panel.xlabel, ylabel=panel.ylabel)
-    axis.set_title(textwrap.fill(panel.title, 50), fontsize=10)
+    axis.set_title(textwrap.fill(panel.title, 42), fontsize=9)
     if len(ticks) <= 6:
         labels = [f"{tick:,.10g}".replace(",", "\u2009") for tick in ticks]
         axis.set_xticks(ticks, labels, fontsize=8)
-    elif scales[0] == "log":  # times, of which every point has its own
-        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-        axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(NullLocator())
     if panel.ylim is not None:
         axis.set_ylim(*panel.ylim)

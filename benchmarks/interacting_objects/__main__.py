@@ -8,7 +8,6 @@ lists the options.
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from textwrap import fill
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -16,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
-from matplotlib.figure import Figure
 
 import mpfjax
+from benchmarks import figures as plotting
 from benchmarks import harness
 from benchmarks.harness import Count, command
 from benchmarks.interacting_objects import scenes as made
@@ -148,10 +147,9 @@ def entries(scene: str, method: str, tracked: np.ndarray) -> list[dict[str, Any]
     num_orders, num_runs = together.shape[:2]
 
     def line(name: str, label: str, rate: float, num: int) -> dict[str, Any]:
-        interval = harness.wilson(rate, num, z=1.96)
         return {
             "scene": scene, "method": name, "label": label, "runs": num_runs, "rate": rate,
-            "interval": interval, "by_order": by_order,
+            "interval": harness.wilson(rate, num, z=1.96), "by_order": by_order,
         }  # fmt: skip
 
     if method != "ps":
@@ -162,21 +160,19 @@ def entries(scene: str, method: str, tracked: np.ndarray) -> list[dict[str, Any]
     ]
 
 
-def draw(results: list[dict[str, Any]]) -> Figure:
+def draw(results: list[dict[str, Any]]) -> Any:
     """A panel for each scene: every method's rate and interval."""
-    scenes = list(dict.fromkeys(line["scene"] for line in results))
-    figure = Figure(figsize=(2.3 * len(scenes) + 1.8, 3.7), layout="constrained")
-    panels = figure.subplots(1, len(scenes), sharey=True, squeeze=False)[0]
-    for panel, scene in zip(panels, scenes, strict=True):
-        lines = [line for line in results if line["scene"] == scene]
-        rates, labels = [line["rate"] for line in lines], [line["label"] for line in lines]
-        panel.hlines(labels, *np.array([line["interval"] for line in lines]).T, linewidth=2)
-        panel.plot(rates, labels, "o", markersize=4)
-        panel.set_title(fill(f"{scene}: {SCENES[scene].title}", 28), fontsize=9)
-        panel.set(xlim=(-0.03, 1.03), xlabel="recovery rate")
-        panel.grid(axis="x", alpha=0.3)
-    panels[0].invert_yaxis()
-    return figure
+
+    def panel(scene: str) -> plotting.Panel:
+        own = [line for line in results if line["scene"] == scene]
+        ends = (lambda line, i=i: line["interval"][i] for i in (0, 1))
+        label = "share of {runs} scenes, with its 95% interval".format_map
+        lines = plotting.lines_of(own, label, "label", "rate", *ends)
+        return plotting.Panel(
+            f"{scene}: {SCENES[scene].title}", "recovery", "", lines, (-0.05, 1.05)
+        )
+
+    return plotting.draw_dots([[panel(s) for s in dict.fromkeys(e["scene"] for e in results)]], 1.5)
 
 
 if __name__ == "__main__":

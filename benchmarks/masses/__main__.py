@@ -34,10 +34,6 @@ from benchmarks.masses.scenes import SCENES, Scene
 
 # Runs of the filter that says what is true where nothing else does; a mode with less is lost.
 REFERENCE_RUNS, LOST = 8, 0.01
-# A picture has room for as many lines as there are colours.
-_DRAWN = (
-    "PF", "PF, rqmc", "MPF", "MPF, equal slots", "MPF, rqmc", "MPF, rqmc, 4 draws",
-)  # fmt: skip
 COLUMNS = {
     "filter": "{filter}",
     "N": "{N}",
@@ -198,19 +194,17 @@ def summary(found: Found, own: dict[str, np.ndarray], region: int) -> dict[str, 
 
 
 def picture(rows: list[dict[str, Any]]) -> Any:
-    """For each scene the error of masses, and of log Ẑ beside it, against the time of a step."""
+    """For each scene the errors of the masses, and of log Ẑ below."""
 
     def panel(scene: str, what: str, label: str) -> plotting.Panel:
         own = [row for row in rows if row["scene"] == scene]
-        shown = [row for row in own if row["filter"] in _DRAWN] or own
-        lines = plotting.lines_of(shown, "filter", "ms", what)
-        return plotting.Panel(scene, "milliseconds a step", label, lines)
+        ends = (lambda row, k=k: row[what] + k * row[what + "_error"] for k in (-2, 2))
+        lines = plotting.lines_of(own, "N = {N}, ± 2 s.e.".format_map, "filter", what, *ends)
+        return plotting.Panel(scene, label, "", lines, (0, None))
 
-    measures = {"mass_rmse": "RMS error of masses", "log_z_sd": "sd of log Ẑ"}
+    measures = {"mass_rmse": "RMSE of the masses", "log_z_rmse": r"RMSE of $\log \hat{Z}$"}
     scenes = dict.fromkeys(row["scene"] for row in rows)
-    return plotting.draw_panels(
-        [[panel(scene, what, label) for what, label in measures.items()] for scene in scenes]
-    )
+    return plotting.draw_dots([[panel(s, *each) for s in scenes] for each in measures.items()], 2.7)
 
 
 if __name__ == "__main__":
