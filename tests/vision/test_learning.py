@@ -173,7 +173,7 @@ def after_all(frames, lasting):
     stronger, overlaps = jnp.zeros((4, 4), bool), jnp.zeros((4, 4))
 
     def step(state, found):
-        return state.after(found, stronger, overlaps, jnp.zeros(2), lasting), None
+        return state.after(found, stronger, overlaps, jnp.zeros((1, 2)), lasting), None
 
     start = jax.tree.map(jnp.asarray, ScoreState.initial(8))
     return jax.lax.scan(step, start, frames)[0]

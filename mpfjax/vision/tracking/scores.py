@@ -71,7 +71,7 @@ class ScoreState(NamedTuple):
         found: Detections,
         stronger: Bool[Array, "d d"],
         overlaps: Float[Array, "d d"],
-        shift: Float[Array, "2"],
+        shift: Float[Array, "#c 2"],
         lasting: Int[Array, ""],
     ) -> "ScoreState":
         """Remember the frame's scores, continue the chains, and set the thresholds.
@@ -115,12 +115,12 @@ class ScoreState(NamedTuple):
         found: Float[Array, "d 4"],
         single: Bool[Array, " d"],
         stronger: Bool[Array, "d d"],
-        shift: Float[Array, "2"],
+        shift: Float[Array, "#c 2"],
         shares: Float[Array, " d"],
         lasting: Array,
     ) -> "ScoreState":
         """The chains after a frame whose detections have these shares of a sure score."""
-        moved = self.boxes + jnp.pad(shift, (0, 2))[None]
+        moved = self.boxes + jnp.pad(shift, ((0, 0), (0, 2)))
         living = (self.unseen < _GONE)[:, None] & single[None]
         overlaps = jnp.maximum(overlap(self.boxes, found), overlap(moved, found))
         overlaps = jnp.where(living, overlaps, 0.0)

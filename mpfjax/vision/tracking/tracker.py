@@ -214,10 +214,8 @@ def advanced(
     motion: CameraMotion | None = None,
 ) -> tuple[TrackerState, Tracks]:
     """A step as a pure function, for `jax.lax.scan` and for programs of your own."""
-    found, spans = (
-        _Found.of(tracker, detections, seen),
-        Spans.at(jnp.asarray(tracker.frames_per_second)),
-    )
+    found = _Found.of(tracker, detections, seen)
+    spans = Spans.at(jnp.asarray(tracker.frames_per_second))
     unlike = _unlikeness(tracker, state, found)
     predicted, noise, camera, shift = _moved(state, found, unlike, motion)
     scores = state.scores.after(
@@ -294,13 +292,15 @@ def _moved(
     found: _Found,
     unlike: Float[Array, "m d"],
     motion: CameraMotion | None,
-) -> tuple[Gaussian, NoiseState, CameraState, Float[Array, "2"]]:
-    """Objects a frame later, moved with the camera, and by how far that was."""
-    before, noise, gone = state.objects, state.noise, jnp.zeros((1, 2))
+) -> tuple[Gaussian, NoiseState, CameraState, Float[Array, "#c 2"]]:
+    """Objects a frame later, moved with the camera, and by how far it moves chains of boxes."""
+    before, noise, gone, away = state.objects, state.noise, jnp.zeros((1, 2)), jnp.zeros((1, 2))
     deviations = state.camera.deviations
     if motion is not None:
         carried = motion.carried(before)
         gone = (carried.place - before.place)[:, :2]
+        chains = Gaussian(*[state.scores.boxes] * 5)
+        away = (motion.carried(chains).place - chains.place)[:, :2]
         before, noise = carried, noise._replace(moments=motion.carried(noise.moments))
         deviations = jnp.where(motion.known, state.camera.left, deviations)
     errors, place, velocity, _ = noise.noises
@@ -318,7 +318,7 @@ def _moved(
     known = jnp.asarray(False) if motion is None else jnp.asarray(motion.known)
     camera, shift = state.camera.after(objects, gone, known, cost, errors, found.places, box)
     noise = noise._replace(moments=noise.moments.shifted(jolt + shift))
-    return objects.shifted(shift), noise, camera, jolt + shift
+    return objects.shifted(shift), noise, camera, away + (jolt + shift)[None]
 
 
 def _associated(
