@@ -18,8 +18,11 @@ import functools
 import importlib
 import inspect
 import math
+import sys
+import traceback
 import types
 import typing
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, ParamSpec, TypeGuard, TypeVar
@@ -389,6 +392,15 @@ def saying(what: str) -> Iterator[None]:
     except Exception as error:
         error.add_note(f"mpfjax: {what}")
         raise
+
+
+def warn(said: str, category: type[Warning] = RuntimeWarning) -> None:
+    """Warn at the line outside of the library from which it was called."""
+    names = [at.f_globals.get("__name__", "") for at, _ in traceback.walk_stack(sys._getframe())]
+    level = max(depth for depth, name in enumerate(names) if name.startswith("mpfjax.")) + 1
+    while names[level].startswith(("equinox.", "jaxtyping.")):  # which wrap methods and functions
+        level += 1
+    warnings.warn(said, category, stacklevel=level + 1)
 
 
 def shown(value: Any) -> str:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int, PyTree, Shaped
 
-from mpfjax.checks import SHARES, as_numbers, checked
+from mpfjax.checks import SHARES, as_numbers, checked, saying
 from mpfjax.operations.logarithms import (
     as_inexact,
     default_float,
@@ -386,7 +386,8 @@ def _averages(average: Callable[[Array], Array], values: PyTree, periods: PyTree
         angle = angle * jnp.broadcast_to(scale, mean.shape)
         return jnp.where(jnp.broadcast_to(period > 0, mean.shape), angle, mean)
 
-    return jax.tree.map(on_circle, values, periods)
+    with saying("in periods, which have the form of one state"):
+        return jax.tree.map(on_circle, values, periods)
 
 
 def _numbers(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:

@@ -278,9 +278,7 @@ def test_objects_have_one_input_or_their_own(per_object, shared):
     expected = jnp.broadcast_to(shift + inputs, (3,))
     np.testing.assert_allclose(moved.mean(axis=0), expected, atol=0.02)
     if not shared:
-        with pytest.raises(
-            ValueError, match=r"inputs: shape \(\) has no leading axis of 3 objects"
-        ):
+        with pytest.raises(ValueError, match=r"inputs: shape \(\) has no leading axis of 3 obj"):
             model.with_inputs(jnp.array(10.0))
 
 
@@ -291,9 +289,12 @@ def run(filter=FILTER, observations=OBSERVATIONS, collect=mean, inputs=INPUTS, *
     return mpfjax.run_filter(KEY, filter, observations, collect, inputs=inputs, **options)
 
 
-def test_an_input_of_a_step_that_is_nan_is_an_error():
+def test_an_input_of_a_step_that_is_nan_or_not_there_is_an_error():
     with pytest.raises(RuntimeError, match="inputs: NaN or infinite"):
         FILTER.step(KEY, FILTER.init(KEY), OBSERVATIONS[0], inputs=built_in(u=np.nan))
+    with pytest.raises(TypeError) as caught:
+        FILTER.step(KEY, FILTER.init(KEY), OBSERVATIONS[0])
+    assert "`inputs` are None: give u_t as inputs=" in caught.value.__notes__[0]
 
 
 def test_a_missing_observation_does_not_miss_its_input():

@@ -85,12 +85,13 @@ def test_what_goes_round_is_averaged_on_its_circle():
     states = mixture.particles
     as_leaves = mixture.replace(particles={"x": states[:, :2], "heading": states[:, 2]})
     found = as_leaves.mean({"x": periods[:2], "heading": periods[2]})
-    assert found["heading"] == pytest.approx(
-        np.angle(weights @ np.exp(1j * np.asarray(states[:, 2]))), 1e-4
-    )
+    turned = np.angle(weights @ np.exp(1j * np.asarray(states[:, 2])))
+    assert found["heading"] == pytest.approx(turned, 1e-4)
     # As features, near ones are as far apart as the numbers are.
     near = OnCircles((0.0, 4.0))(jnp.array([[0.0, 1.999], [0.3, -1.999]]))
     np.testing.assert_allclose(jnp.hypot(*(near[1] - near[0])[1:]), 0.002, rtol=0.01)
+    with pytest.raises(ValueError, match="periods: 2 for a state of 3 numbers"):
+        OnCircles((0.0, 4.0))(states)
 
 
 def test_flattening_puts_all_leaves_side_by_side():

@@ -40,9 +40,17 @@ def drawn(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:
     if is_mixed(model):
         noise = normal(key, before.shape, noise_dtype(states))
         return latent_from_noise(model, noise, states)
-    draws = model.sample_transition(key, before)
+    with saying(f"in {_asked(model, 'sample_transition')}"):
+        draws = model.sample_transition(key, before)
     check_moved(draws, before, model)
     return draws
+
+
+def _asked(model: Any, method: str) -> str:
+    """The method's name for a note, and whether the model's `inputs` are missing."""
+    none = getattr(model, "inputs", ()) is None
+    who = f"model: {model_name(model)}.{method}"
+    return f"{who}, whose `inputs` are None: give u_t as inputs=, or in a Series" if none else who
 
 
 def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
@@ -50,7 +58,7 @@ def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
     before = drawn_part(model, states)
     if is_mixed(model):
         return latent_from_noise(model, noise, states)
-    who = f"model: {model_name(model)}.transition_from_noise"
+    who = _asked(model, "transition_from_noise")
     with saying(f"in {who}, of noise of shape {noise.shape}, as noise_dimension says"):
         draws = model.transition_from_noise(noise, before)
     check_moved(draws, before, model, "transition_from_noise")
@@ -78,7 +86,8 @@ def log_transition(model: Any, draws: PyTree, states: PyTree) -> Float[Array, " 
     """log D of what was drawn of x_t, given x_{t-1}, checked."""
     if is_mixed(model):
         return log_latent_density(model, draws, states)
-    values = model.log_transition(draws, drawn_part(model, states))
+    with saying(f"in {_asked(model, 'log_transition')}"):
+        values = model.log_transition(draws, drawn_part(model, states))
     num_particles = jax.tree.leaves(draws)[0].shape[0]
     return check_log_density(values, model, "log_transition", num_particles)
 
@@ -104,7 +113,7 @@ def seen(
 
 def own_likelihoods(model: Any, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
     """The model's own `log_likelihood`, of a latent without what is seen of x, checked."""
-    who = f"model: {model_name(model)}.log_likelihood"
+    who = _asked(model, "log_likelihood")
     with saying(f"in {who}, of a step of the observations that is {kinds(observation)}"):
         values = model.log_likelihood(observation, states)
     num_particles = jax.tree.leaves(states)[0].shape[0]

@@ -1,7 +1,6 @@
 """Long runs: one loop with a file to go on from, a bar, and an end at Ctrl-C or what is broken."""
 
 import os
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 from tqdm import tqdm
 
-from mpfjax.checks import Checked, Count
+from mpfjax.checks import Checked, Count, warn
 from mpfjax.running.storage import (
     arrays_of,
     described,
@@ -111,9 +110,7 @@ class LongRun:
             if state.step > saved:
                 pieces = [self._saved(state, pieces)]
         if stopped is not None:
-            warnings.warn(
-                f"{self.caller}: {stopped}; its result is of the steps before", stacklevel=3
-            )
+            warn(f"{self.caller}: {stopped}; its result is of the steps before", UserWarning)
         return state._replace(rows=_joined(pieces)), stopped
 
     def _saved(self, state: State, pieces: list[PyTree]) -> PyTree:

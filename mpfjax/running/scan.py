@@ -2,7 +2,6 @@
 
 import inspect
 import math
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.chain import BROKEN_DENSITY
-from mpfjax.checks import saying
+from mpfjax.checks import saying, warn
 from mpfjax.filter import Filter, StepInfo
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import Series
@@ -171,7 +170,7 @@ def sound(run: FilterRun) -> FilterRun:
         which = f" in {is_blind.sum()} of {is_blind.size} runs" if is_blind.ndim else ""
         said = f"every step with an observation was degenerate{which}: no particle had any"
         said += " likelihood; mpfjax.check_model tries a model out"
-        warnings.warn(said, RuntimeWarning, stacklevel=3)
+        warn(said)
     surprised = run.surprised
     # Restarts see to it themselves.
     if surprised is not None and np.any(surprised) and SURPRISE not in run.final.memory:
@@ -181,5 +180,5 @@ def sound(run: FilterRun) -> FilterRun:
         first = int(np.argmax(steps.reshape(-1, steps.shape[-1]).any(axis=0)))
         said = f"what was seen speaks against all hypotheses{which}, first at index {first} of the"
         said += " steps: run.surprised; mpfjax.with_restarts lets the state begin anew"
-        warnings.warn(said, RuntimeWarning, stacklevel=3)
+        warn(said)
     return run

@@ -1,6 +1,5 @@
 """Backward sampling: whole trajectories from their distribution given all observations."""
 
-import warnings
 from typing import Any, Literal
 
 import jax
@@ -9,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import Count, CountOrZero, checked
+from mpfjax.checks import Count, CountOrZero, checked, warn
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -174,12 +173,10 @@ def _warn_of_few(indices: Int[Array, "t k"], log_weights: Float[Array, "t n"]) -
     shares = counts[few] / np.minimum(num_drawn, possible)
     worst = int(np.argmin(shares))
     if shares[worst] < _SMALL_SHARE:
-        warnings.warn(
+        warn(
             f"sample_trajectories: at index {few[worst]} of the times {counts[few[worst]]} of the"
             f" {num_drawn} trajectories are distinct, a share of {shares[worst]:.2g}: the backward"
-            " weights degenerate, see docs/smoothing.md",
-            RuntimeWarning,
-            stacklevel=4,
+            " weights degenerate, see docs/smoothing.md"
         )
 
 

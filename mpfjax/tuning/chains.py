@@ -3,7 +3,6 @@
 import abc
 import math
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypedDict
 
@@ -14,7 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import Checked, Count, CountOrZero
+from mpfjax.checks import Checked, Count, CountOrZero, warn
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.running.long_runs import Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.densities import SamplePrior, chosen, drawn
@@ -121,7 +120,7 @@ class Sampling(Checked):
         state, stopped = run.go(State(0, at[0], none), start, advance)
         draws = jax.tree.map(lambda rows: np.moveaxis(rows[:num_draws], 0, 1), state.rows)
         num_invalid = jax.tree.map(np.asarray, state.carry.num_invalid)
-        warn_of_invalid(self.caller, num_invalid, stacklevel=5)
+        warn_of_invalid(self.caller, num_invalid)
         factor = np.asarray(state.carry.walk.factor)
         fields = {"num_invalid": num_invalid, "stopped": stopped, "problem": self.problem}
         return draws, fields | {"proposal_covariance": factor @ factor.T}
@@ -190,15 +189,13 @@ class Sampling(Checked):
         return advance
 
 
-def warn_of_invalid(caller: str, num_invalid: Mapping[str, Any], stacklevel: int) -> None:
+def warn_of_invalid(caller: str, num_invalid: Mapping[str, Any]) -> None:
     """Warn of densities that were not numbers, by their names."""
     counts = {name: int(np.sum(count)) for name, count in num_invalid.items()}
     found = [f"{name} {count} times" for name, count in counts.items() if count]
     if found:
-        warnings.warn(
-            f"{caller}: NaN or +inf, taken for zero density: {', '.join(found)}",
-            stacklevel=stacklevel,
-        )
+        said = f"{caller}: NaN or +inf, taken for zero density: {', '.join(found)}"
+        warn(said, UserWarning)
 
 
 @jit_on_wide_vectors

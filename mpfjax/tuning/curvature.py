@@ -1,6 +1,5 @@
 """Standard errors from the curvature of the log marginal likelihood."""
 
-import warnings
 from collections.abc import Callable
 
 import jax
@@ -9,7 +8,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, checked
+from mpfjax.checks import Count, checked, warn
 from mpfjax.filter import Filter
 from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms, score_of_each
@@ -88,7 +87,7 @@ def errors_at(
     covariance = _inverse(informations.mean(axis=0))
     if covariance is None:
         said = "the log marginal likelihood has no maximum here, or too few seeds to see it"
-        warnings.warn(f"standard_errors: {said}", stacklevel=4)
+        warn(f"standard_errors: {said}", UserWarning)
         return None
     _warn_of_noise(informations, of_seeds)
     # By the Jacobian of the parameters on their own scale, laid out in the same order.
@@ -181,4 +180,4 @@ def _warn_of_noise(informations: Float[np.ndarray, "seeds d d"], of_seeds: str) 
         return
     found = f"differ by {apart:.0%}" if np.isfinite(apart) else "may be no errors at all"
     said = f"{num_seeds} seeds leave them uncertain: those of two halves {found}; raise {of_seeds}"
-    warnings.warn(f"standard_errors: {said}", stacklevel=5)
+    warn(f"standard_errors: {said}", UserWarning)

@@ -1,6 +1,5 @@
 """The log marginal likelihood of a filter as an objective of its parameters."""
 
-import warnings
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Rule, kinds
+from mpfjax.checks import Rule, kinds, warn
 from mpfjax.filter import Filter
 from mpfjax.models.observations import Series, as_series, gathered
 from mpfjax.moves.base import AbstractMove
@@ -92,7 +91,7 @@ def warn_of_bias(caller: str, problem: Problem) -> None:
     if names and moves:
         said = f"{caller}: {type(moves[0]).__name__} has no gradient, so that the score of"
         said += f' {", ".join(names)} is biased; build the filter with gradient="stop"'
-        warnings.warn(said, stacklevel=4)
+        warn(said, UserWarning)
 
 
 def _nodes(tree: PyTree, kind: type) -> list[Any]:

@@ -1,6 +1,5 @@
 """`fit` and `maximise`: gradient ascent on the log marginal likelihood, or another objective."""
 
-import warnings
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import Count, CountOrZero, Rule, checked, shown
+from mpfjax.checks import Count, CountOrZero, Rule, checked, shown, warn
 from mpfjax.filter import Filter
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.curvature import errors_at
@@ -193,9 +192,7 @@ class _Ascent:
             # The parameters are those of the step before, and so is their value.
             if stopped is None:
                 stopped = f"{fault} at step {state.step}"
-                warnings.warn(
-                    f"{self.caller}: {stopped}; its result is of the step before", stacklevel=4
-                )
+                warn(f"{self.caller}: {stopped}; its result is of the step before", UserWarning)
             reals, value = jax.tree.map(lambda rows: jnp.asarray(rows[-1]), path), float(values[-1])
         history = {self.objective: values, "deviation": deviations}
         history |= self.problem.constrained_rows(path)

@@ -236,7 +236,7 @@ class _Run:
             state, stopped = run.go_on(state, self._advance)
         samples, _, num_invalid = state.carry
         new = {name: count - before[name] for name, count in num_invalid.items()}
-        warn_of_invalid("smc2", new, stacklevel=4 if keys is None else 5)
+        warn_of_invalid("smc2", new)
         return SequentialPosterior(
             self.sampler.problem.constrained_rows(samples.particles.reals),
             np.asarray(samples.log_weights),

@@ -76,8 +76,7 @@ def told():
         places = np.where(np.arange(40) < 20, -10.0, 11.0 if carried else -10.0)
         seen = (places + 0.2 * rng.normal(size=40)).astype(np.float32)
         for name, change in (("alarm", mpfjax.with_alarm), ("restarts", mpfjax.with_restarts)):
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
+            with warnings.catch_warnings(record=True, action="always") as caught:
                 run = mpfjax.monte_carlo(keys, change(plain), seen, nothing)
             found[name, carried] = run, [str(each.message) for each in caught]
     return found

@@ -227,8 +227,7 @@ class TestBias:
             self.warn(filter, parameters)
 
     def test_what_is_right_is_not(self):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             self.warn(mpfjax.particle_filter(ScalarLinear(), 16, gradient="stop"))
             learning = mpfjax.particle_filter(ScalarLinear(), 16, proposal=proposal())
             self.warn(learning, WEIGHTS)

@@ -64,8 +64,10 @@ class OnCircles(NamedTuple):
 
     def __call__(self, states: PyTree) -> Float[Array, "n k"]:
         """The features of each particle."""
-        columns = []
-        for column, period in zip(flatten_states(states).T, self.periods, strict=True):
+        columns, numbers = [], flatten_states(states).T
+        if len(numbers) != len(self.periods):
+            raise ValueError(f"periods: {len(self.periods)} for a state of {len(numbers)} numbers")
+        for column, period in zip(numbers, self.periods, strict=True):
             radius = period / (2 * np.pi)
             circle = lambda x, r: [r * jnp.cos(x / r), r * jnp.sin(x / r)]  # noqa: E731
             columns += circle(column, radius) if period else [column]

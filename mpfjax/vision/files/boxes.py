@@ -2,13 +2,12 @@
 
 import codecs
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import shown, to_rows
+from mpfjax.checks import shown, to_rows, warn
 
 _COMMENTS = ("#", "%", "//")
 # The names that a header may give to the columns, in lower case and without "_".
@@ -75,12 +74,8 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     rows = list(read_rows(path, TRACK_FORM, TRACK_COLUMNS, least_id=0).values())
     flags = [row[6] for row in rows]
     if set(flags) == {0.0, 1.0}:
-        warnings.warn(
-            f"{path}: {flags.count(0.0)} rows are flagged 0, as a ground truth flags what does not"
-            " count; read_truth leaves them out",
-            RuntimeWarning,
-            stacklevel=2,
-        )
+        said = f"{path}: {flags.count(0.0)} rows are flagged 0, as a ground truth flags what does"
+        warn(f"{said} not count; read_truth leaves them out")
     return np.array([row[:6] for row in rows])
 
 

@@ -1,7 +1,6 @@
 """What may be given as detections: rows of a file, boxes frame by frame, or a detector to call."""
 
 import itertools
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mpfjax.checks import CountOrZero, checked, is_series, saying, shown
+from mpfjax.checks import CountOrZero, checked, is_series, saying, shown, warn
 from mpfjax.vision.files.boxes import read_detections
 from mpfjax.vision.tracking.detections import DetectedBoxes, to_masked_rows
 
@@ -91,7 +90,7 @@ def observed(
         for number, still in frames:
             yield number, still, detector.of_frame(number)
         if late := detector.num_after(number):
-            _warn(f"detections: {late} lie in frames after the last, {number}, and were left out")
+            warn(f"detections: {late} lie in frames after the last, {number}, and were left out")
         return
     coming = iter(()) if callable(detector) else iter(detector)
     for number, still in frames:
@@ -106,7 +105,7 @@ def observed(
             raise ValueError(f"detections: end before the frames do, at frame {number}")
         yield number, still, DetectedBoxes.of(found, f"detections: frame {number}")
     if next(coming, _END) is not _END:
-        _warn(f"detections: go on after the last frame, {number}, and were left out")
+        warn(f"detections: go on after the last frame, {number}, and were left out")
 
 
 class Sieve:
@@ -157,7 +156,7 @@ class Once:
         """Warn, unless a warning of this kind was given before."""
         if kind not in self.said:
             self.said.add(kind)
-            _warn(f"{message} (here and wherever else it is so)")
+            warn(f"{message} (here and wherever else it is so)")
 
 
 def _present(found: DetectedBoxes, number: int) -> tuple[DetectedBoxes, Bool[np.ndarray, " k"]]:
@@ -170,7 +169,3 @@ def _present(found: DetectedBoxes, number: int) -> tuple[DetectedBoxes, Bool[np.
             raise ValueError(f"{named}: {what}{shown(values)} is not finite, or masked")
     kept = None if scores is None else np.ma.getdata(scores)
     return DetectedBoxes(np.ma.getdata(boxes), kept, classes), present
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, RuntimeWarning, stacklevel=4)
