@@ -216,8 +216,8 @@ BUGS = {
     ),
     "objects move against the camera": Bug(
         "vision/tracking/tracker.py",
-        "return objects.shifted(shift), noise, camera, jolt + shift",
-        "return objects.shifted(-shift), noise, camera, jolt + shift",
+        "return objects.shifted(shift), noise, camera, away + (jolt + shift)[None]",
+        "return objects.shifted(-shift), noise, camera, away + (jolt + shift)[None]",
         "tests/vision/test_tracker.py -k shaking",
     ),
     "births do not know the frame rate": Bug(
