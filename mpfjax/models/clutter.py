@@ -118,5 +118,5 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
 
 def _measured(observation: PyTree) -> Bool[Array, " k"]:
     """Which rows are measurements: those without a NaN."""
-    rows = [jnp.isnan(leaf).reshape(leaf.shape[0], -1) for leaf in jax.tree.leaves(observation)]
-    return ~jnp.any(jnp.concatenate(rows, axis=1), axis=1)
+    leaves = map(jnp.isnan, jax.tree.leaves(observation))
+    return ~jnp.any(jnp.stack([leaf.any(tuple(range(1, leaf.ndim))) for leaf in leaves]), axis=0)

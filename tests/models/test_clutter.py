@@ -133,13 +133,13 @@ def test_chances_and_densities_may_be_functions_and_measurements_trees_of_one_pa
     values, gradients = jax.value_and_grad(
         lambda x: jnp.sum(model.log_likelihood({"y": jnp.asarray(y)}, x))
     )(jnp.asarray(states))
-    p, measured = 0.9 * np.exp(-np.abs(states)), y[1:3]
-    density = scipy.stats.norm.pdf(np.log(measured)[:, None], states) / measured[:, None]
-    expected = 1 - p + p * np.sum(density / (0.1 * measured[:, None]), axis=0)
-    np.testing.assert_allclose(values, np.log(expected).sum(), rtol=1e-5)
+    p, measured = 0.9 * np.exp(-np.abs(states)), y[1:3, None]
+    ratios = scipy.stats.norm.pdf(np.log(measured), states) / measured / (0.1 * measured)
+    np.testing.assert_allclose(values, np.sum(np.log(1 - p + p * np.sum(ratios, 0))), rtol=1e-5)
     assert np.isfinite(gradients).all()
-    moved = model.with_inputs(jnp.float32(100.0)).sample_transition(KEY, jnp.zeros(3))
-    assert (moved > 90).all()
+    assert (model.with_inputs(jnp.float32(100.0)).sample_transition(KEY, jnp.zeros(3)) > 90).all()
+    missed = MODEL.log_likelihood(jnp.zeros((0, 1)), jnp.zeros((1, 1)))  # no room for any
+    assert missed == pytest.approx(np.log(1 - P_D))
 
 
 def test_what_needs_a_single_measurement_is_refused():
