@@ -93,7 +93,7 @@ def sample_trajectories(
         )
     else:
         if method == "mcmc":
-            stacked = with_parents(stacked, "sample_trajectories with method 'mcmc'")
+            stacked = with_parents(stacked, "sample_trajectories with method 'mcmc', not 'exact',")
         options = (num_trajectories, component, 0 if method == "exact" else num_steps or 1)
         drawn, indices = draw_trajectories(key, model, stacked, inputs, *options)
     _warn_of_few(indices, stacked.log_weights)
