@@ -150,7 +150,7 @@ def open_targets(
     else:
         name, rows = sequence.name, read_truth(sequence / "gt.txt").objects
         stills = np.stack(list(frames.read_frames(sequence, first, last)))
-    ids = ids or sorted(box_files.boxes_of_frame(rows, first))[:2]
+    ids = ids or sorted({int(row[1]) for row in rows if row[0] == first})[:2]
     boxes = boxes_over_time(rows, ids, first, len(stills))
     for t, target in np.argwhere(np.isnan(boxes).any(axis=2)):
         raise ValueError(f"--ids: object {ids[target]} has no box in frame {first + t}")

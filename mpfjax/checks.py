@@ -37,6 +37,7 @@ from jax.core import Tracer
 P = ParamSpec("P")
 R = TypeVar("R")
 
+_INNER = ("mpfjax.", "equinox.", "jaxtyping.", "contextlib")  # modules that users need not see
 _LONGEST = 200
 _MOST = 2**31 - 1
 # Of the largest entry of a covariance, which rounding may change by this much.
@@ -306,7 +307,11 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         for name, rule in _rules(function).items():
             if name in values:
                 rule.check(values[name], name)
-        return function(*args, **kwargs)
+        try:
+            return function(*args, **kwargs)
+        except Exception as error:
+            error.__traceback__ = _outside(error.__traceback__)
+            raise
 
     return call
 
@@ -394,13 +399,22 @@ def saying(what: str) -> Iterator[None]:
         raise
 
 
+def _outside(found: types.TracebackType | None) -> types.TracebackType | None:
+    """Its frames outside of the library, and the last one, unless JAX shows its own frames."""
+    kept = None
+    for frame, line in reversed(list(traceback.walk_tb(found))):
+        is_shown = kept is None or getattr(jax.config, "jax_traceback_filtering", "") == "off"
+        if is_shown or not frame.f_globals.get("__name__", "").startswith(_INNER):
+            kept = types.TracebackType(kept, frame, frame.f_lasti, line)
+    return kept
+
+
 def warn(said: str, category: type[Warning] = RuntimeWarning) -> None:
     """Warn at the line outside of the library from which it was called."""
     names = [at.f_globals.get("__name__", "") for at, _ in traceback.walk_stack(sys._getframe())]
-    level = max(depth for depth, name in enumerate(names) if name.startswith("mpfjax.")) + 1
-    while names[level].startswith(("equinox.", "jaxtyping.")):  # which wrap methods and functions
-        level += 1
-    warnings.warn(said, category, stacklevel=level + 1)
+    last = max(depth for depth, name in enumerate(names) if name.startswith("mpfjax."))
+    caller = next(k for k, name in enumerate(names) if k > last and not name.startswith(_INNER))
+    warnings.warn(said, category, stacklevel=caller + 1)
 
 
 def shown(value: Any) -> str:

@@ -70,7 +70,7 @@ def open_source(
 def _with_objects(source: Source, box: Sequence[str], ids: Sequence[int] | None) -> Source:
     """Settle which objects are started where, and which are scored."""
     rows, first = source.truth, source.first
-    started = {} if rows is None else box_files.boxes_of_frame(rows, first)
+    started = {int(row[1]): row[2:6] for row in ([] if rows is None else rows) if row[0] == first}
     if box:
         boxes = np.stack([box_files.parse_box(text, "--box") for text in box])
         ids = [id for id, own in started.items() if covers(boxes, own[None]).any()]

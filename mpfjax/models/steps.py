@@ -48,9 +48,8 @@ def drawn(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:
 
 def _asked(model: Any, method: str) -> str:
     """The method's name for a note, and whether the model's `inputs` are missing."""
-    none = getattr(model, "inputs", ()) is None
-    who = f"model: {model_name(model)}.{method}"
-    return f"{who}, whose `inputs` are None: give u_t as inputs=, or in a Series" if none else who
+    missing = ", whose `inputs` are None: give u_t as inputs=, or in a Series"
+    return f"model: {model_name(model)}.{method}" + missing * (getattr(model, "inputs", ()) is None)
 
 
 def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:

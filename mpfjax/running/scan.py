@@ -174,9 +174,8 @@ def sound(run: FilterRun) -> FilterRun:
     surprised = run.surprised
     # Restarts see to it themselves.
     if surprised is not None and np.any(surprised) and SURPRISE not in run.final.memory:
-        steps, which = np.asarray(surprised), ""
-        if steps.ndim > 1:
-            which = f" in {steps.any(axis=-1).sum()} of {len(steps)} runs"
+        steps = np.asarray(surprised)
+        which = f" in {steps.any(axis=-1).sum()} of {len(steps)} runs" if steps.ndim > 1 else ""
         first = int(np.argmax(steps.reshape(-1, steps.shape[-1]).any(axis=0)))
         said = f"what was seen speaks against all hypotheses{which}, first at index {first} of the"
         said += " steps: run.surprised; mpfjax.with_restarts lets the state begin anew"

@@ -191,11 +191,9 @@ class Sampling(Checked):
 
 def warn_of_invalid(caller: str, num_invalid: Mapping[str, Any]) -> None:
     """Warn of densities that were not numbers, by their names."""
-    counts = {name: int(np.sum(count)) for name, count in num_invalid.items()}
-    found = [f"{name} {count} times" for name, count in counts.items() if count]
+    found = [f"{name} {np.sum(each)} times" for name, each in num_invalid.items() if np.any(each)]
     if found:
-        said = f"{caller}: NaN or +inf, taken for zero density: {', '.join(found)}"
-        warn(said, UserWarning)
+        warn(f"{caller}: NaN or +inf, taken for zero density: {', '.join(found)}", UserWarning)
 
 
 @jit_on_wide_vectors

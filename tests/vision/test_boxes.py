@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from mpfjax.vision.files.boxes import (
-    boxes_of_frame,
     check_boxes,
     read_detections,
     read_tracks,
@@ -23,7 +22,6 @@ def test_what_is_written_is_read(tmp_path):
     lines = path.read_text().splitlines()
     assert lines[0] == "1,2,1.000,2.000,3.000,4.000,1,-1,-1,-1"
     np.testing.assert_array_equal(read_tracks(path), rows[[2, 1, 0]])
-    assert list(boxes_of_frame(read_tracks(path), 1)) == [2, 7]
 
 
 @pytest.mark.parametrize(

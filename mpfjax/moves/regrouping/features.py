@@ -68,9 +68,8 @@ class OnCircles(NamedTuple):
         if len(numbers) != len(self.periods):
             raise ValueError(f"periods: {len(self.periods)} for a state of {len(numbers)} numbers")
         for column, period in zip(numbers, self.periods, strict=True):
-            radius = period / (2 * np.pi)
-            circle = lambda x, r: [r * jnp.cos(x / r), r * jnp.sin(x / r)]  # noqa: E731
-            columns += circle(column, radius) if period else [column]
+            r = period / (2 * np.pi)
+            columns += [r * jnp.cos(column / r), r * jnp.sin(column / r)] if period else [column]
         return jnp.stack(columns, axis=1)
 
 

@@ -120,11 +120,6 @@ def format_tracks(rows: Float[np.ndarray, "rows 6"]) -> str:
     return "".join(lines)
 
 
-def boxes_of_frame(rows: Float[np.ndarray, "rows 6"], frame: int) -> dict[int, np.ndarray]:
-    """The boxes of one frame by their id."""
-    return {int(row[1]): row[2:6] for row in rows if row[0] == frame}
-
-
 def read_rows(
     path: str | Path,
     form: str,

@@ -3,7 +3,6 @@
 import contextlib
 import math
 import re
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mpfjax.checks import Count, Positive, checked, optional
+from mpfjax.checks import Count, Positive, checked, optional, warn
 from mpfjax.vision.files.sequences import read_sequence_info
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
@@ -218,9 +217,7 @@ def _decoded(path: Path) -> Iterator[Any]:
                 continue
             yield from frames
     if damaged:
-        warnings.warn(
-            f"{path}: some frames are damaged, and were left out", RuntimeWarning, stacklevel=2
-        )
+        warn(f"{path}: some frames are damaged, and were left out")
 
 
 @contextlib.contextmanager
