@@ -45,8 +45,8 @@ class Resample(AbstractResampling):
       resampled, as `allocation` says. A number k gives each living component k particles and
       leaves the other slots empty, as section 5.2 of the paper does.
     - `allocation`: how the components share the slots, where neither `particles_per_component` nor
-      `share_by` says it. "variance" deals component m a number in proportion to
-      (k_m Σ_{c_i = m} exp 2ℓ_i)^(1/2) = π_m (k_m / ESS_m)^(1/2), which leaves Ẑ the least variance
+      `share_by` says it. "variance" deals component m a number in proportion to the root of
+      k_m Σ_{c_i = m} exp 2ℓ_i, or of π_m^2 k_m / ESS_m, which leaves Ẑ the least variance
       (Neyman 1934), and shares a quarter to a half equally, so that every mode stays alive (see
       docs/masses.md). "equal" is the paper's: it keeps modes of little mass longest, and log Ẑ is
       less exact.
