@@ -174,7 +174,7 @@ def both_represented(
     positions: Float[Array, "s t n"], occupied: Bool[Array, "s t n"], truth: Float[Array, " t"]
 ) -> Bool[Array, "s t"]:
     """Whether both modes, at x*_t and -x*_t, are represented, at every step of every run."""
-    near = jnp.abs(positions[:, :, None] - jnp.stack([truth, -truth], axis=1)[..., None]) < RADIUS
+    near = jnp.abs(positions[:, :, None] - jnp.stack([truth, -truth], 1)[None, ..., None]) < RADIUS
     return (near & occupied[:, :, None]).any(axis=-1).all(axis=-1)
 
 
