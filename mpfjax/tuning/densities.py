@@ -15,7 +15,7 @@ from mpfjax.tuning.evidence import UnbiasedFilter, pose_evidence
 from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms
 from mpfjax.tuning.transforms import AbstractTransform
 
-LogPrior = Callable[[dict[str, Array]], Float[Array, ""]]
+LogPrior = Callable[[dict[str, Array]], Float[Array, ""] | float]
 SamplePrior = Callable[[Key[Array, ""]], Mapping[str, Array]]
 
 
@@ -27,7 +27,7 @@ class Prior(eqx.Module):
 
     def __call__(self, reals: Reals) -> Float[Array, ""]:
         """The log density, up to the constant that the function leaves out."""
-        density = self.function(
+        density: Any = self.function(
             {name: self.transforms[name].constrain(u) for name, u in reals.items()}
         )
         for name, u in reals.items():
@@ -145,11 +145,11 @@ def checked_prior(
         draws = drawn(cast(Any, key), problem, sample_prior, 1)
         at, where = jax.tree.map(lambda u: u[0], draws), "a draw of sample_prior"
     density = log_prior(problem.constrain(at))
-    if getattr(density, "shape", None) != () or not jnp.issubdtype(density.dtype, jnp.floating):
+    shape = () if isinstance(density, int | float) else getattr(density, "shape", None)
+    if shape != ():
         raise ValueError(f"log_prior: {shown(density)} at {where} is no floating point number")
     prior = Prior(log_prior, problem.transforms)
-    value = float(prior(at))
-    if not np.isfinite(value):
+    if not np.isfinite(value := float(prior(at))):
         raise ValueError(f"log_prior: {value} at {where}")
     return prior
 

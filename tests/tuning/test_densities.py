@@ -38,6 +38,8 @@ def test_it_is_prior_jacobian_and_likelihood():
         found[:2], norm.logpdf(jnp.exp(values[:2]), 1, 0.5) + values[:2], rtol=1e-5
     )
     assert (found[2:] == -jnp.inf).all()
+    flat = density_of(density.problem.tree, log_prior=lambda parameters: 0.0)
+    assert flat({"r": values[0]}, jax.random.key(0)) == values[0]
     slope = jax.grad(lambda u: density({"r": u}, jax.random.key(0)))(values[0])
     assert float(slope) == pytest.approx(0.3 * (1 - 0.3) / 0.25 + 1, rel=1e-4)
     assert float(density.constrain(density.start)["r"]) == pytest.approx(0.5)
