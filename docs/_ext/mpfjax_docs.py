@@ -133,9 +133,23 @@ def _mathml(self: HTML5Translator, node: nodes.Element, as_block: bool) -> None:
     raise nodes.SkipNode
 
 
+def keep_marks(app: Sphinx, doctree: nodes.document) -> None:
+    """A formula within a line keeps the comma after it, which browsers would let begin a line."""
+    for formula in doctree.findall(nodes.math):
+        text = formula.next_node(descend=False, siblings=True)
+        if isinstance(text, nodes.Text) and (found := re.match("[,.;:)]+", text)):
+            formula["mark"] = found[0]
+            text.parent.replace(text, nodes.Text(text[found.end() :]))
+
+
 def visit_math(self: HTML5Translator, node: nodes.Element) -> None:
     """A formula within a line."""
-    _mathml(self, node, as_block=False)
+    self.body.append('<span class="formula">')
+    try:
+        _mathml(self, node, as_block=False)
+    except nodes.SkipNode:
+        self.body.append(node.get("mark", "") + "</span>")
+        raise
 
 
 def visit_math_block(self: HTML5Translator, node: nodes.Element) -> None:
@@ -156,4 +170,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("autodoc-before-process-signature", forget_rules)
     app.connect("autodoc-process-signature", process_signature)
     app.connect("doctree-read", shorten_types)
+    app.connect("doctree-read", keep_marks)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
