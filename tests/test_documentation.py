@@ -41,8 +41,7 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     """All blocks of a page in their order, as a reader runs them: without the tests' strictness."""
     examples = list(sybil.parse(page).examples())
     assert examples
-    if page in GALLERY:  # there the code draws the page's picture
-        monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(tmp_path)  # the gallery draws its pictures there
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         for example in examples:
             example.evaluate()
