@@ -120,10 +120,10 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
 def with_selected_start(filter: Filter, num_draws: Count | None = None) -> Filter:
     """The filter whose x_0 is chosen by y_1 among K N draws: a `SelectInitial` moves it first.
 
-    `num_draws` is K; with one, x_0 is a plain draw again. None takes four draws a particle, and
-    2^17 in all where a pilot of N shows that these are too few. The look at y_1 is that of the
-    filter's own propagation. Raises `ValueError` for K < 1, and for a filter without a
-    `Propagate` or `PropagateNested`. Use it where the prior is wide beside the likelihood.
+    `num_draws` is K; with one, x_0 is a plain draw again. None, as in mixtures, takes four draws a
+    particle, and more where a pilot shows that the prior is wide. The look at y_1 is that of the
+    filter's own propagation. Raises `ValueError` for K < 1, and for a filter without a `Propagate`
+    or `PropagateNested`. Use it where the prior is wide beside the likelihood.
     """
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
     if num_draws == 1:

@@ -264,7 +264,7 @@ def office(seed: int, steps: int | None) -> Scene:
     """Nine rooms of 8 x 6 m that are equal, but for a pillar that is seen at the end."""
     room = np.zeros((60, 80), bool)
     room[[0, -1]] = room[:, [0, -1]] = True
-    room[0:38, 55:57] = room[44:59, 18:20] = room[20:28, 12:22] = room[48:59, 34:38] = True
+    room[0:38, 55:57] = room[54:59, 18:20] = room[20:28, 12:22] = room[48:59, 34:38] = True
     wall = np.tile(room, (3, 3))
     wall[70:75, 146:151] = True
     corners = _WAY + np.array([8, 6])

@@ -6,38 +6,50 @@ from typing import Any, NamedTuple, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count, shown
-from mpfjax.mixture import ParticleMixture, single_component
+from mpfjax.mixture import ParticleMixture, flatten_states, single_component
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_states,
     is_made_of_noise,
 )
-from mpfjax.models.conditionally_linear import with_moments
+from mpfjax.models.conditionally_linear import is_marginalised, with_moments
 from mpfjax.models.noise import Noise, draw_noise
 from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.propagation.tempered import accepted
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import HILBERT, Line, sorted_order
+from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.logarithms import (
     add_gradient,
     default_float,
     exp,
     finite_or_zero,
     largest,
+    log_sum_exp,
     without_gradient,
 )
-from mpfjax.operations.random import split
-from mpfjax.operations.stored import cond_if_any, most_of_runs, stored, take, whole
+from mpfjax.operations.random import normal, split, uniform
+from mpfjax.operations.stored import cond_if_any, stored, take, whole
 
 # A particle that the first observation tells nothing of keeps a quarter of its chance, so that no
 # weight is more than four times the mean.
 MOST_TRUST = 3 / 4
-# Draws of x_0 for each particle; and in all, where y_1 leaves fewer draws of a pilot than this.
-FEW_DRAWS, MANY_DRAWS = 4, 2**17
-LEAST_EFFECTIVE = 32.0
-LEAST_LOG = -1000.0  # of likelihoods of zero, so that they have a mean
+# Draws of x_0 for each particle; for a wide prior so many, but no more than these in all.
+FEW_DRAWS, MANY_DRAWS, MOST_DRAWS = 4, 128, 2**17
+# A prior is wide where y_1 leaves less than this number of a pilot's draws, and than this part.
+LEAST_EFFECTIVE, LEAST_PART = 16.0, 1 / 16
+LEAST_LOG = -100.0  # of likelihoods of zero, beside the largest, so that they have a mean
+NOWHERE = -1e30  # log ν where y_1 cannot be, so that differences are numbers
+# Of a tempered start: the largest last power of ν, and how much two looks at the same x_0 may
+# differ in log ν at that; the moves, from the least part of the last power on; and the least part
+# of a deviation of x_0 that a step takes. Chosen on a drawn office among 16 settings.
+LAST_POWER, NATS = 1 / 2, 2.0
+NUM_MOVES, LEAST_POWER, LEAST_SIZE = 36, 2.0**-4, 2.0**-8
 
 
 def sample_initial(
@@ -67,10 +79,13 @@ class SelectInitial(AbstractMove):
     increment, and Ẑ stays unbiased. A wide prior is covered as by K N particles, at the cost of
     2 K more draws of x_1 in the whole run.
 
-    Without a K it is four, and there are 2^17 draws in all where the particles that it is given
-    show that four are too few: of these, y_1 leaves an effective number of less than 32, and it
-    tells more of x_0 than of the step to x_1. A pose in a building is such a state. For thousands
-    of short runs of few particles so many draws cost far more than the run.
+    Without a K it is four, and more for a wide prior, such as that of a pose in a building. A pilot
+    of N draws shows it, where a state has several numbers: y_1 leaves an effective number of less
+    than 16 of them, and of N / 16, and tells more of x_0 than of the step to x_1. A model with
+    `log_initial`, or whose x_0 is made of noise, then has a `tempered_start`, any other 128 draws
+    a particle, but at most 2^17 in all. Either costs as much as 150 to 300 steps that only
+    propagate, and makes a first result a second later. There is no pilot with more than 2^15
+    particles, nor with "rqmc".
 
     Without an observation it does nothing. Where an initial move weighs x_0, the chain's `Resample`
     waits for y_1: it would undo the choice.
@@ -106,109 +121,54 @@ class SelectInitial(AbstractMove):
         if observation is None:
             return mixture
         n = mixture.num_particles
-        num_rounds = 1 + max(0, MANY_DRAWS - FEW_DRAWS * n) // ((FEW_DRAWS - 1) * n)
-        if self.num_draws is not None or num_rounds == 1:
-            start = self._round(key, observation, n).mixture
-        else:
-            start = self._in_rounds(key, mixture, observation, num_rounds)
+        start = self._selected(key, observation, n, self.num_draws or FEW_DRAWS)
+        if self._may_be_wide(mixture):
+            constant, given, observed = without_gradient((self, mixture.particles, observation))
+            keys = jax.random.fold_in(key, 1), jax.random.fold_in(key, 2)
+            # Draws of their own decide, so that Ẑ stays unbiased.
+            pilot = two_looks(keys[0], constant.propagation, given, observed)
+            is_needed, last_power = is_wide(pilot), power_of(pilot)
+            few, many = start, lambda: self._of_many(keys[1], given, observation, last_power)
+            dear = cond_if_any(is_needed, many, lambda: few)
+            start = jax.tree.map(lambda new, old: jnp.where(is_needed, new, old), dear, few)
         own = {name: getattr(mixture, name) for name in ("ancestor_indices", "memory")}
         return start.replace(num_components=mixture.num_components, **own)
 
-    def _in_rounds(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree, num_rounds: int
+    def _may_be_wide(self, mixture: ParticleMixture) -> bool:
+        """On a line few draws suffice; many would be another program to compile."""
+        is_line = flatten_states(mixture.particles).shape[1] == 1
+        has_room = FEW_DRAWS * mixture.num_particles < MOST_DRAWS
+        return self.num_draws is None and self.noise != "rqmc" and has_room and not is_line
+
+    def _of_many(
+        self, key: Key[Array, ""], given: PyTree, observation: PyTree, power: Float[Array, ""]
     ) -> ParticleMixture:
-        """The choice from one round of draws, or from all of them, by one program."""
-        n = mixture.num_particles
-        constant, observed, given = without_gradient((self, observation, mixture.particles))
-        # The particles given decide, which are draws of their own, so that Ẑ stays unbiased.
-        looks = two_looks(jax.random.fold_in(key, 1), constant.propagation, given, observed)
-        number = jnp.where(is_wide(looks), num_rounds, 1)
-        most = most_of_runs(number)
+        """The start from a wide prior, in which places among the draws have no meaning."""
+        n = jax.tree.leaves(given)[0].shape[0]
+        if can_be_tempered(self.propagation.model, given):
+            return tempered_start(key, self.propagation, observation, given, power)
+        num_draws = max(FEW_DRAWS, min(MANY_DRAWS, MOST_DRAWS // n))
+        return self._selected(key, observation, n, num_draws)
 
-        def advance(state: tuple) -> tuple:
-            t, key, before = state
-            after = constant._round(key, observed, n, t, before)
-            kept = jax.tree.map(lambda new, old: jnp.where(t < number, new, old), after, before)
-            return t + 1, jax.random.fold_in(key, 2), kept
-
-        shapes = jax.eval_shape(lambda: constant._round(key, observed, n))
-        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        start = (jnp.zeros((), jnp.int32), key, nothing)
-        *_, kept = jax.lax.while_loop(lambda state: state[0] < most, advance, start)
-        return kept.mixture.replace(particles=self._differentiable(key, kept, num_rounds))
-
-    def _round(
-        self,
-        key: Key[Array, ""],
-        observation: PyTree,
-        n: int,
-        t: Int[Array, ""] | int = 0,
-        before: "Kept | None" = None,
-    ) -> "Kept":
-        """N of the draws of round t; from the second on, those kept before are N of its draws."""
+    def _selected(
+        self, key: Key[Array, ""], observation: PyTree, n: int, num_draws: int
+    ) -> ParticleMixture:
+        """N of K N draws; a few draws a particle at a time, so that memory has room for them."""
         key_drawn, key_look, key_kept = split(key, 3)
-        k = self.num_draws or FEW_DRAWS
-        drawn = sample_initial(key_drawn, self.propagation.model, k * n, self.noise)
-        log_factors = two_looks(key_look, self.propagation, drawn, observation)
-        places, weights = jnp.arange(k * n, dtype=jnp.int32), jnp.ones(k * n, log_factors.dtype)
-        pool = (drawn, log_factors.T, weights, jnp.full_like(places, t), places)
-        if before is not None:
-            # In units of one draw, of which there have been so many.
-            number = n * (1 + (k - 1) * jnp.asarray(t, weights.dtype))
-            old_weights = number * exp(before.mixture.log_weights + before.mixture.log_scale)
-            mixture, old_factors, *origins = before
-            old = (mixture.particles, old_factors.T, old_weights, *origins)
-            # One of every K gives way, any of them: a model's draws may stand in line.
-            j = jax.random.randint(jax.random.fold_in(key, 3), (), 0, k)
+        at_once = next(k for k in range(2 * FEW_DRAWS, 0, -1) if num_draws % k == 0)
 
-            def put(new: Array, old: Array) -> Array:
-                rows = new.reshape(n, k, *new.shape[1:])
-                return rows.at[:, j].set(jnp.where(t > 0, old, rows[:, j])).reshape(new.shape)
+        def look(keys: Key[Array, "2"]) -> tuple[PyTree, Float[Array, "k 2"]]:
+            drawn = sample_initial(keys[0], self.propagation.model, at_once * n, self.noise)
+            return drawn, two_looks(keys[1], self.propagation, drawn, observation).T
 
-            pool = jax.tree.map(put, pool, old)
-        drawn, log_factors, weights, *origins = pool
-        log_factors = log_factors.T
-        mixture = chosen(key_kept, drawn, log_factors, n, weights, in_order=self.noise == "rqmc")
-        number = (k + (k - 1) * jnp.asarray(t, weights.dtype)) / k
-        mixture = mixture.replace(log_scale=mixture.log_scale - jnp.log(number))
-        index = mixture.ancestor_indices
-        return Kept(mixture, log_factors[:, index], *(take(each, index) for each in origins))
-
-    def _differentiable(self, key: Key[Array, ""], kept: "Kept", num_rounds: int) -> PyTree:
-        """The particles kept, with the derivatives of drawing them once more."""
-        particles = kept.mixture.particles
-        num_drawn = FEW_DRAWS * kept.mixture.num_particles
-
-        def add(state: tuple, t: Int[Array, ""]) -> tuple[tuple, None]:
-            key, again = state
-            here = kept.rounds == t
-
-            def taken() -> PyTree:
-                drawn = sample_initial(
-                    split(key, 3)[0], self.propagation.model, num_drawn, self.noise
-                )
-                rows = lambda leaf: here.reshape(-1, *[1] * (leaf.ndim - 1))  # noqa: E731
-                pick = lambda new, old: jnp.where(rows(old), take(new, kept.places), old)  # noqa: E731
-                return jax.tree.map(pick, drawn, again)
-
-            again = cond_if_any(jnp.any(here), taken, lambda: again)
-            return (jax.random.fold_in(key, 2), again), None
-
-        start = (key, jax.tree.map(jnp.zeros_like, particles))
-        (_, again), _ = jax.lax.scan(add, start, jnp.arange(num_rounds, dtype=jnp.int32))
-        derive = lambda leaf, source: (  # noqa: E731
-            add_gradient(leaf, source) if eqx.is_inexact_array(leaf) else leaf
-        )
-        return jax.tree.map(derive, particles, again)
-
-
-class Kept(NamedTuple):
-    """The draws that are kept after some rounds, and where they come from."""
-
-    mixture: ParticleMixture
-    log_factors: Float[Array, "2 n"]
-    rounds: Int[Array, " n"]
-    places: Int[Array, " n"]  # among the draws of the round
+        if (num_rounds := num_draws // at_once) == 1:
+            drawn, log_factors = look(jnp.stack([key_drawn, key_look]))
+        else:
+            rounds = [jax.random.split(each, num_rounds) for each in (key_drawn, key_look)]
+            found = jax.lax.map(look, jnp.stack(rounds, axis=1))
+            flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
+            drawn, log_factors = jax.tree.map(flat, found)
+        return chosen(key_kept, drawn, log_factors.T, n, in_order=self.noise == "rqmc")
 
 
 def two_looks(
@@ -226,7 +186,6 @@ def chosen(
     drawn: PyTree,
     log_factors: Float[Array, "2 k"],
     num_slots: int,
-    draw_weights: Float[Array, " k"] | None = None,
     number: Int[Array, ""] | None = None,
     in_order: bool = False,
 ) -> ParticleMixture:
@@ -234,14 +193,12 @@ def chosen(
 
     They fill the first `number` slots, or all, in one component; the ancestors are their places
     among the draws. The logarithm of their mass, of which 1 is the mean, is the mixture's
-    `log_scale`. With `draw_weights` the draws weigh so much from the start.
+    `log_scale`.
     """
+    trust = stored(jax.lax.stop_gradient(trusted(log_factors, jnp.ones_like(log_factors[0]))))
     pool = single_component(drawn)
-    given = jnp.ones_like(log_factors[0]) if draw_weights is None else draw_weights
-    trust = stored(jax.lax.stop_gradient(trusted(log_factors, given)))
-    chances = trust if draw_weights is None else stored(trust * given)
     order = sorted_order(pool, pool.component_indicators, HILBERT) if in_order else None
-    weights = whole(chances if order is None else take(chances, order), 0.0)
+    weights = whole(trust if order is None else take(trust, order), 0.0)
     totals = jnp.sum(weights, keepdims=True)
     line = Line(pool.num_particles, weights, totals, jnp.zeros_like(totals), weights > 0, order)
     targets = jnp.full(1, num_slots if number is None else number, jnp.int32)
@@ -253,8 +210,93 @@ def chosen(
     particles = jax.tree.map(lambda leaf: take(leaf, kept.particles), drawn)
     return single_component(particles).replace(
         log_weights=jnp.where(filled, -jnp.log(trust * total), -jnp.inf),
-        log_scale=jnp.log(total / targets[0].astype(total.dtype)) + jnp.log(jnp.mean(given)),
+        log_scale=jnp.log(total / targets[0].astype(total.dtype)),
         ancestor_indices=kept.particles,
+    )
+
+
+class Placed(NamedTuple):
+    """What a tempered start moves: x_0, or the noise that it is made of, and log ν."""
+
+    places: PyTree
+    log_factors: Float[Array, " k"]
+
+
+def can_be_tempered(model: Any, states: PyTree) -> bool:
+    """Whether a random walk on x_0 leaves its law as it is."""
+    if is_made_of_noise(model, "initial"):
+        return True
+    has_density = callable(getattr(model, "log_initial", None)) and not is_marginalised(model)
+    return has_density and all(map(eqx.is_inexact_array, jax.tree.leaves(states)))
+
+
+def tempered_start(
+    key: Key[Array, ""],
+    propagation: Any,
+    observation: PyTree,
+    given: PyTree,
+    last_power: Float[Array, ""],
+) -> ParticleMixture:
+    """N particles that represent x_0, most of them where y_1 speaks for them.
+
+    A sampler of Del Moral, Doucet and Jasra (2006): 4 N draws of x_0 are resampled and moved for
+    rising powers of ν, the likelihood of y_1 at a draw of x_1 (Andrieu and Roberts 2009). Each move
+    is a random walk with a new draw of x_1. Its steps lie between the deviation of `given`, N draws
+    of x_0, and 1/256 of it, in each coordinate another, so that some fit a mode of any width. x_0
+    is moved itself, or the noise that it is made of. In the end every fourth is kept and weighs
+    ν^-`last_power`; the mass of all, with a mean of 1, is the `log_scale`.
+    """
+    source = propagation.model
+    propagation, observation, given = without_gradient((propagation, observation, given))
+    model, n = propagation.model, jax.tree.leaves(given)[0].shape[0]
+    of_noise, number, dtype = is_made_of_noise(model, "initial"), FEW_DRAWS * n, default_float()
+    key_drawn, key_look, key_stages, key_kept = split(key, 4)
+    if of_noise:
+        places = normal(key_drawn, (number, model.initial_noise_dimension), dtype)
+        scale = jnp.ones((1, 1))
+    else:
+        places = model.sample_initial(key_drawn, number)
+        scale = jnp.std(flatten_states(given), axis=0, keepdims=True)
+    to_places = jax.vmap(ravel_pytree(jax.tree.map(lambda leaf: leaf[0], places))[1])
+
+    def states(model: Any, places: PyTree) -> PyTree:
+        return with_moments(model, model.initial_from_noise(places) if of_noise else places)
+
+    def log_prior(model: Any, places: PyTree) -> Float[Array, " k"]:
+        return -0.5 * jnp.sum(places**2, axis=1) if of_noise else model.log_initial(places)
+
+    def log_look(key: Key[Array, ""], places: PyTree) -> Float[Array, " k"]:
+        seen = propagation(key, single_component(states(model, places)), observation)
+        log_factors = seen.log_weights + seen.log_scale + np.log(number)
+        return jnp.maximum(jnp.where(log_factors < jnp.inf, log_factors, NOWHERE), NOWHERE)
+
+    def advance(mixture: ParticleMixture, stage: tuple) -> tuple[ParticleMixture, None]:
+        key, power, growth = stage
+        key_drawn, key_size, key_step, key_look, key_accepted = split(key, 5)
+        mixture = mixture.weighed(growth * mixture.particles.log_factors)
+        mixture = Resample()(key_drawn, mixture)
+        now = mixture.particles
+        flat = flatten_states(now.places)
+        size = scale * LEAST_SIZE ** uniform(key_size, flat.shape, flat.dtype)
+        places = to_places(flat + size * normal(key_step, flat.shape, flat.dtype))
+        new = Placed(places, log_look(key_look, places))
+        log_ratio = power * (new.log_factors - now.log_factors)
+        log_ratio += log_prior(model, places) - log_prior(model, now.places)
+        return mixture.replace(particles=accepted(key_accepted, log_ratio, new, now)), None
+
+    powers = last_power * LEAST_POWER ** jnp.linspace(1.0, 0.0, NUM_MOVES, dtype=dtype)
+    stages = jax.random.split(key_stages, NUM_MOVES), powers, jnp.diff(powers, prepend=0.0)
+    start = single_component(Placed(places, log_look(key_look, places)))
+    moved, _ = jax.lax.scan(advance, start, stages)
+    # One of every four, so that each has the same chance.
+    kept = FEW_DRAWS * jnp.arange(n) + jax.random.randint(key_kept, (), 0, FEW_DRAWS)
+    places, log_factors = jax.tree.map(lambda leaf: take(leaf, kept), moved.particles)
+    log_weights = moved.log_mass - np.log(n) - last_power * log_factors
+    if not of_noise:
+        log_weights = add_gradient(log_weights, log_prior(source, places))
+    log_total = log_sum_exp(log_weights)
+    return single_component(states(source, places)).replace(
+        log_weights=log_weights - log_total, log_scale=log_total
     )
 
 
@@ -264,13 +306,27 @@ def is_wide(log_factors: Float[Array, "2 n"]) -> Bool[Array, ""]:
     The first is Kish's effective number (Σ L̄)² / Σ L̄², of the mean of two looks at each draw; the
     second that the two are correlated.
     """
-    below = jnp.where(log_factors < jnp.inf, log_factors, -jnp.inf)
-    relative = jnp.maximum(below - finite_or_zero(largest(below.ravel())), LEAST_LOG)
-    mean = jnp.sum(exp(relative), 0)
-    deviations = relative - jnp.mean(relative, 1, keepdims=True)
+    looks = beside_largest(log_factors)
+    mean = jnp.sum(exp(looks), 0)
+    deviations = looks - jnp.mean(looks, 1, keepdims=True)
     covariances = deviations @ deviations.T
     tells = 2 * covariances[0, 1] > jnp.sqrt(covariances[0, 0] * covariances[1, 1])
-    return (jnp.sum(mean) ** 2 < LEAST_EFFECTIVE * jnp.sum(mean**2)) & tells
+    fewest = min(LEAST_EFFECTIVE, LEAST_PART * looks.shape[1])
+    return (jnp.sum(mean) ** 2 < fewest * jnp.sum(mean**2)) & tells
+
+
+def power_of(log_factors: Float[Array, "2 n"]) -> Float[Array, ""]:
+    """The last power of a tempered start: the less two looks agree where y_1 speaks for x_0."""
+    looks = beside_largest(log_factors)
+    weights = jnp.sum(exp(looks), 0)
+    ratio = jnp.sum(weights * exp(-jnp.abs(looks[0] - looks[1]))) / jnp.sum(weights)
+    return NATS / jnp.maximum(-jnp.log(ratio), NATS / LAST_POWER)
+
+
+def beside_largest(log_factors: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
+    """The same beside the largest, which is 0; none is infinite or no number."""
+    below = jnp.where(log_factors < jnp.inf, log_factors, -jnp.inf)
+    return jnp.maximum(below - finite_or_zero(largest(below.ravel())), LEAST_LOG)
 
 
 def trusted(log_factors: Float[Array, "2 n"], weights: Float[Array, " n"]) -> Float[Array, " n"]:
