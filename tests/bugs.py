@@ -257,11 +257,11 @@ BUGS = {
         "return objects[0]",
         "tests/moves/test_partitioned.py -k moved_last",
     ),
-    "many rounds of draws of x_0 count as one": Bug(
+    "a tempered start weighs by all of the likelihood": Bug(
         "moves/initial.py",
-        "number = (k + (k - 1) * jnp.asarray(t, weights.dtype)) / k",
-        "number = jnp.ones((), weights.dtype)",
-        "tests/test_initial.py -k wide",
+        "- last_power * log_factors",
+        "- log_factors",
+        "tests/test_initial.py -k searched",
     ),
     "restarts forget the mass of their choice": Bug(
         "moves/restarts.py",

@@ -96,9 +96,9 @@ def follow(
     motion, deviations, poses, seen = (jnp.asarray(part, jnp.float32) for part in both)
     keys, given = jax.random.split(jax.random.key(seed), seeds), (seen, (motion, deviations))
     particles, logs, increments = run(filter, model, size, components, keys, given)
-    away = particles - poses[None, :, None]
-    turned = jnp.abs((away[..., 2] + jnp.pi) % (2 * jnp.pi) - jnp.pi)
-    near = (jnp.hypot(away[..., 0], away[..., 1]) < model.near) & (turned < 0.4)
+    x, y, turn = jnp.moveaxis(particles - poses[None, :, None], -1, 0)
+    turned = jnp.abs((turn + jnp.pi) % (2 * jnp.pi) - jnp.pi)
+    near = (jnp.hypot(x, y) < model.near) & (turned < 0.4)
     right = jnp.sum(jnp.where(near, jnp.exp(logs), 0.0), axis=-1) > 0.5
     log_z = jnp.sum(increments[:, : len(drives[0].poses)], axis=1)
     return Found(np.asarray(right), np.asarray(log_z, float))
@@ -107,9 +107,8 @@ def follow(
 def summary(found: list[Found], carried: int) -> dict[str, Any]:
     """Over all runs, with standard errors; `by_step` is the share of runs that are right."""
     right = np.concatenate([each.right for each in found]).astype(float)
-    deviations = np.array([each.log_z.std(ddof=1) for each in found])
-    runs, deviation = len(right), float(np.sqrt(np.mean(deviations**2)))
-    by_step = right.mean(axis=0)
+    deviation = float(np.sqrt(np.mean([each.log_z.var(ddof=1) for each in found])))
+    runs, by_step = len(right), right.mean(axis=0)
     errors = np.sqrt(by_step * (1 - by_step) / runs)
     after = right[:, carried:] > 0
     ever = after.any(axis=1)

@@ -63,6 +63,12 @@ class Robot(mpfjax.AbstractStateSpaceModel):
         headings = jax.random.uniform(keys[2], (num_particles, 1), minval=-jnp.pi, maxval=jnp.pi)
         return jnp.concatenate([places, headings], axis=1)
 
+    def log_initial(self, states: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Zero on free cells."""
+        is_free = jnp.zeros(self.known.shape, bool).at[self.cells(self.free)[:2]].set(True)
+        rows, columns, inside = self.cells(states[:, :2])
+        return jnp.where(inside & is_free[rows, columns], 0.0, -jnp.inf)
+
     def sample_transition(
         self, key: Key[Array, ""], states: Float[Array, "n 3"]
     ) -> Float[Array, "n 3"]:
@@ -137,7 +143,7 @@ class Ring(Ranges):
     the corridor, y nothing, and the heading 0 or pi.
     """
 
-    odometry = (0.05, 0.0)
+    odometry, log_initial = (0.05, 0.0), None  # its heading is one of two
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n 3"]:
         """x_0."""
