@@ -172,8 +172,7 @@ Scene = tuple[Any, list[Stretch]]
 def drives(model: Any, seed: int, path: Callable[[np.random.Generator], np.ndarray]) -> Scene:
     """Noisy odometry and scans along four paths, each from the pose of x_0 on."""
     found = []
-    for number in range(4):
-        rng = np.random.default_rng([seed, number])
+    for rng in [np.random.default_rng([seed, number]) for number in range(4)]:
         poses = path(rng)
         moved, cos, sin = np.diff(poses, axis=0), np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
         forward, left = cos * moved[:, 0] + sin * moved[:, 1], cos * moved[:, 1] - sin * moved[:, 0]
