@@ -42,7 +42,7 @@ MOST_TRUST = 3 / 4
 # Draws of x_0 for each particle; for a wide prior so many, but no more than these in all.
 FEW_DRAWS, MANY_DRAWS, MOST_DRAWS = 4, 128, 2**17
 # A prior is wide where y_1 leaves less than this number of a pilot's draws, and than this part.
-LEAST_EFFECTIVE, LEAST_PART = 16.0, 1 / 16
+LEAST_EFFECTIVE, LEAST_PART = 16.0, 1 / 64
 LEAST_LOG = -100.0  # of likelihoods of zero, beside the largest, so that they have a mean
 NOWHERE = -1e30  # log ν where y_1 cannot be, so that differences are numbers
 # Of a tempered start: the largest last power of ν, and how much two looks at the same x_0 may
@@ -81,7 +81,7 @@ class SelectInitial(AbstractMove):
 
     Without a K it is four, and more for a wide prior, such as that of a pose in a building. A pilot
     of N draws shows it, where a state has several numbers: y_1 leaves an effective number of less
-    than 16 of them, and of N / 16, and tells more of x_0 than of the step to x_1. A model with
+    than 16 of them, and of N / 64, and tells more of x_0 than of the step to x_1. A model with
     `log_initial`, or whose x_0 is made of noise, then has a `tempered_start`, any other 128 draws
     a particle, but at most 2^17 in all. Either costs as much as 150 to 300 steps that only
     propagate, and makes a first result a second later. There is no pilot with more than 2^15
