@@ -87,10 +87,9 @@ class AdaptiveMonteCarlo(mpfjax.AbstractMove):
 
 
 def replace_some(
-    model: Any, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, observation: Any
+    model: Any, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, _observation: Any
 ) -> mpfjax.ParticleMixture:
     """One in a hundred particles is drawn from x_0's law."""
-    del observation
     keys, size = jax.random.split(key), mixture.num_particles
     is_new = jax.random.uniform(keys[0], (size, 1)) < 0.01
     drawn = model.sample_initial(keys[1], size)

@@ -143,7 +143,8 @@ class Ring(Ranges):
     the corridor, y nothing, and the heading 0 or pi.
     """
 
-    odometry, log_initial = (0.05, 0.0), None  # its heading is one of two
+    odometry = (0.05, 0.0)
+    log_initial: Any = None  # its heading is one of two
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n 3"]:
         """x_0."""
