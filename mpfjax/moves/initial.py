@@ -81,11 +81,11 @@ class SelectInitial(AbstractMove):
 
     Without a K it is four, and more for a wide prior, such as that of a pose in a building. A pilot
     of N draws shows it, where a state has several numbers: y_1 leaves an effective number of less
-    than 16 of them, and of N / 64, and tells more of x_0 than of the step to x_1. A model with
-    `log_initial`, or whose x_0 is made of noise, then has a `tempered_start`, any other 128 draws
-    a particle, but at most 2^17 in all. Either costs as much as 150 to 300 steps that only
-    propagate, and makes a first result a second later. There is no pilot with more than 2^15
-    particles, nor with "rqmc".
+    than 16 of them, and of N / 64, and tells more of x_0 than of the step to x_1. A model whose x_0
+    is made of noise, or that has `log_initial`, a density in all numbers of the state, then has a
+    `tempered_start`, any other 128 draws a particle, but at most 2^17 in all. Either costs as much
+    as 150 to 300 steps that only propagate, and makes a first result a second later. There is no
+    pilot with more than 2^15 particles, nor with "rqmc".
 
     Without an observation it does nothing. Where an initial move weighs x_0, the chain's `Resample`
     waits for y_1: it would undo the choice.
