@@ -47,7 +47,7 @@ LEAST_LOG = -100.0  # of likelihoods of zero, beside the largest, so that they h
 NOWHERE = -1e30  # log ν where y_1 cannot be, so that differences are numbers
 # Of a tempered start: the largest last power of ν, and how much two looks at the same x_0 may
 # differ in log ν at that; the moves, from the least part of the last power on; and the least part
-# of a deviation of x_0 that a step takes. Chosen on a drawn office among 16 settings.
+# of a deviation of x_0 that a step takes. Chosen on a drawn office among 25 settings.
 LAST_POWER, NATS = 1 / 2, 2.0
 NUM_MOVES, LEAST_POWER, LEAST_SIZE = 36, 2.0**-4, 2.0**-8
 
