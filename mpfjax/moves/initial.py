@@ -267,7 +267,7 @@ def tempered_start(
 
     def log_look(key: Key[Array, ""], places: PyTree) -> Float[Array, " k"]:
         seen = propagation(key, single_component(states(model, places)), observation)
-        log_factors = seen.log_weights + seen.log_scale + np.log(number)
+        log_factors = seen.log_weights + seen.log_scale  # up to a constant, which cancels
         return jnp.maximum(jnp.where(log_factors < jnp.inf, log_factors, NOWHERE), NOWHERE)
 
     def advance(mixture: ParticleMixture, stage: tuple) -> tuple[ParticleMixture, None]:
