@@ -14,12 +14,8 @@ from mpfjax.models.base import AbstractStateSpaceModel, with_inputs
 from mpfjax.models.observations import Fault, faults_of
 from mpfjax.moves.base import AbstractMove, Moves, name_of, with_inner, without_dead
 from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
-from mpfjax.operations.logarithms import (
-    excess_over_islands,
-    island_index,
-    num_islands,
-    scaled_log_sum_exp,
-)
+from mpfjax.operations.islands import excess_over_islands, island_index, num_islands
+from mpfjax.operations.logarithms import scaled_log_sum_exp
 
 # In the memory while a move reads it: the growth of the mass in the step so far.
 INCREMENT = "log_increment"

@@ -75,7 +75,7 @@ BUGS = {
     ),
     # running
     "islands forget each other's scale": Bug(
-        "operations/logarithms.py",
+        "operations/islands.py",
         "log_total = log_sum_exp(sums + (((scales - common) + largest) - shift))",
         "log_total = log_sum_exp(sums)",
         "tests/test_devices.py -k unbiased",

@@ -18,7 +18,7 @@ import mpfjax
 from mpfjax.exact import grid_filter
 from mpfjax.operations import compiling
 from mpfjax.operations.compiling import cpu_options, in_little_memory
-from mpfjax.operations.logarithms import DEVICE_AXIS, ISLAND_AXIS
+from mpfjax.operations.islands import DEVICE_AXIS, ISLAND_AXIS
 from mpfjax.operations.segments import segment_sum
 from mpfjax.running.devices import choose_devices, over_threads
 from mpfjax.running.islands import IslandInteraction

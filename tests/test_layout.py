@@ -14,7 +14,7 @@ ORDER = """
 # Inside the folders that hold several floors: files, and folders.
 FLOORS = {
     "operations": """
-        logarithms stored matrices compiling random prefix_sums segments
+        logarithms islands rows stored matrices compiling random prefix_sums segments
     """,
     "moves": """
         base eve_indices conditional every regrouping resampling propagation metropolis objects

@@ -20,6 +20,7 @@ from mpfjax.operations.matrices import (
     transformed,
 )
 from mpfjax.operations.prefix_sums import count_starts, count_upto, few_upto, sum_before
+from mpfjax.operations.rows import select_rows
 from mpfjax.operations.segments import (
     segment_any,
     segment_argmax,
@@ -431,3 +432,17 @@ def test_draws_that_are_made_once_are_the_same_and_stay_one_branch():
     assert "cond[" in str(jax.make_jaxpr(together)(keys))
     scaled = lambda a: jnp.sum(drawn_once(keys[0], lambda key: a * jax.random.normal(key, (3,))))  # noqa: E731
     np.testing.assert_allclose(jax.grad(scaled)(2.0), scaled(1.0), rtol=1e-6)
+
+
+def test_rows_are_selected_whole_whatever_their_axes():
+    chosen = np.array([True, False, True])
+    new = {"number": jnp.arange(3.0), "matrix": jnp.asarray(RNG.normal(size=(3, 2, 4)))}
+    old = jax.tree.map(jnp.negative, new)
+    found = select_rows(jnp.asarray(chosen), new, old)
+    for i, is_new in enumerate(chosen):
+        for name in new:
+            np.testing.assert_array_equal(found[name][i], (new if is_new else old)[name][i])
+    of_pairs = select_rows(
+        jnp.asarray([chosen, ~chosen]), new["matrix"][None], jnp.zeros((2, 3, 1, 1))
+    )
+    np.testing.assert_array_equal(of_pairs[1], np.where(chosen[:, None, None], 0, new["matrix"]))

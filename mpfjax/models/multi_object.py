@@ -22,6 +22,7 @@ from mpfjax.models.base import (
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.random import split
+from mpfjax.operations.rows import select_rows
 
 # A number of particles that is hardly ever the length of a parameter's axis.
 _TRIAL = 1_000_003
@@ -211,12 +212,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         num_particles = jax.tree.leaves(particles)[0].shape[0]
         objects = jnp.broadcast_to(objects, (num_particles,))
         chosen = objects[:, None] == self._indices[None]
-
-        def put(leaf: Array, new: Array) -> Array:
-            where = chosen.reshape(chosen.shape + (1,) * (leaf.ndim - 2))
-            return jnp.where(where, new[:, None], leaf)
-
-        return jax.tree.map(put, particles, states)
+        return select_rows(chosen, jax.tree.map(lambda leaf: leaf[:, None], states), particles)
 
     def sample_object_transition(
         self, key: Key[Array, ""], states: PyTree, objects: Int[Array, "*n"]

@@ -4,9 +4,6 @@ In numpy: `np.log(np.sum(np.exp(x)))` and `np.exp(x) / np.sum(np.exp(x))`. Here 
 subtracted first, and -inf everywhere is a case of its own. A weight that is too small to count
 becomes zero, since a CPU takes a hundred times as long for subnormal numbers. What these and others
 need of floating point types, maxima and gradients stands here too.
-
-The total of a filter's weights may be one over islands of particles. In numpy they would be a
-leading axis. Here they are two named axes, one of devices and one of islands on a device.
 """
 
 import math
@@ -16,8 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Inexact, Int, PyTree, Shaped
 
-DEVICE_AXIS = "mpfjax_devices"
-ISLAND_AXIS = "mpfjax_islands"
 _INTEGERS = {2: jnp.int16, 4: jnp.int32, 8: jnp.int64}
 
 
@@ -151,62 +146,3 @@ def log_or_nothing(total: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
     """log with a gradient of zero at zero, where it is -inf; NaN stays NaN."""
     empty = total == 0
     return jnp.where(empty, -jnp.inf, jnp.log(jnp.where(empty, 1.0, total)))
-
-
-def num_islands() -> int:
-    """The number of islands; 1 outside `run_islands`."""
-    try:
-        # Constants, known during tracing.
-        return jax.lax.psum(1, ISLAND_AXIS) * jax.lax.psum(1, DEVICE_AXIS)
-    except NameError:
-        return 1
-
-
-def island_index() -> Int[Array, ""]:
-    """The index of this island, from 0. Only inside `run_islands`."""
-    first = jax.lax.axis_index(DEVICE_AXIS) * jax.lax.psum(1, ISLAND_AXIS)
-    return first + jax.lax.axis_index(ISLAND_AXIS)
-
-
-def over_islands(value: Array) -> Array:
-    """The values of all islands, in their order, on a new leading axis; the same for each.
-
-    The order does not depend on the number of devices, and so a sum does not either.
-    """
-    on_device = jax.lax.all_gather(value, ISLAND_AXIS)
-    everywhere = jax.lax.all_gather(on_device, DEVICE_AXIS)
-    return everywhere.reshape(-1, *value.shape)
-
-
-def deal_to_islands(values: Array) -> Array:
-    """Row i of every island to island i mod G; the leading axis must be a multiple of G.
-
-    A second call brings the rows of an island back to it, in another order.
-    """
-    num_devices, on_device = jax.lax.psum(1, DEVICE_AXIS), jax.lax.psum(1, ISLAND_AXIS)
-    # Under vmap, JAX 0.10 gives a wrong shape to a value that is the same on all devices.
-    values = jnp.where(island_index() >= 0, values, values)
-    dealt = values.reshape(-1, num_devices, on_device, *values.shape[1:])
-    dealt = jax.lax.all_to_all(dealt, ISLAND_AXIS, split_axis=2, concat_axis=2)
-    dealt = jax.lax.all_to_all(dealt, DEVICE_AXIS, split_axis=1, concat_axis=1)
-    return dealt.reshape(values.shape)
-
-
-def excess_over_islands(
-    log_scale: Float[Array, ""], log_largest: Float[Array, ""], log_sum: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """The excess of an island's scale over that of all islands, and log of the mass of all.
-
-    The log mass of an island is given in three parts, scale + largest + sum. That of all islands is
-    returned in two, total + scale. So rounding of a large part does not destroy a small one. Each
-    island sends O(1) numbers. Outside `run_islands` there is one island, and its excess is 0.
-    """
-    if num_islands() == 1:
-        return jnp.zeros_like(log_sum), log_sum, log_scale + log_largest
-    scales, largest, sums = over_islands(jnp.stack([log_scale, log_largest, log_sum])).T
-    counts = sums > -jnp.inf
-    # Part by part, which is exact; an island without mass does not count.
-    common = finite_max(jnp.where(counts, scales, -jnp.inf))
-    shift = finite_max(jnp.where(counts, (scales - common) + largest, -jnp.inf))
-    log_total = log_sum_exp(sums + (((scales - common) + largest) - shift))
-    return ((log_scale - common) + log_largest) - shift, log_total, common + shift

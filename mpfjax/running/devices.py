@@ -19,7 +19,7 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, PyTree
 
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors
-from mpfjax.operations.logarithms import DEVICE_AXIS
+from mpfjax.operations.islands import DEVICE_AXIS
 from mpfjax.running.storage import fingerprint, is_key
 
 

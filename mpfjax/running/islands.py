@@ -17,14 +17,14 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import as_series
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.logarithms import (
+from mpfjax.operations.islands import (
     DEVICE_AXIS,
     ISLAND_AXIS,
     deal_to_islands,
     num_islands,
     over_islands,
-    softmax,
 )
+from mpfjax.operations.logarithms import softmax
 from mpfjax.running.devices import choose_devices, over_devices
 from mpfjax.running.scan import FilterRun, scan, sound
 

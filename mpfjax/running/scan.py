@@ -18,7 +18,7 @@ from mpfjax.filter import Filter, StepInfo
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import Series
 from mpfjax.moves.restarts import ALARM, SURPRISE
-from mpfjax.operations.logarithms import num_islands
+from mpfjax.operations.islands import num_islands
 from mpfjax.operations.random import split, split_for_run, split_keys
 
 
