@@ -166,7 +166,9 @@ def newest(session: nox.Session) -> None:
 
 @nox.session(python=sys.executable)
 def wheel(session: nox.Session) -> None:
-    """The wheel holds mpfjax alone, and in an empty environment README's first filter runs."""
+    """The wheel holds mpfjax alone; in an empty environment README's first filter runs, from the
+    wheel and from a clone beside the script.
+    """
     wheel, sdist = build(session)
     session.install("twine")
     session.run("twine", "check", "--strict", str(wheel), str(sdist))
@@ -202,3 +204,13 @@ def wheel(session: nox.Session) -> None:
     )
     session.chdir(wheel.parent)
     session.run(python, "first.py", external=True)
+
+    # As README begins: from a clone, whose folder is called mpfjax, with the script beside it.
+    clone = wheel.parent / "beside" / "mpfjax"
+    with tarfile.open(sdist) as archive:
+        archive.extractall(clone.parent, filter="data")
+    (clone.parent / sdist.name.removesuffix(".tar.gz")).rename(clone)
+    session.run(python, "-m", "pip", "install", "-q", "--no-deps", "-e", str(clone), external=True)
+    beside = clone.parent / "first.py"
+    beside.write_text(f"{first[1]}\nassert mpfjax.__file__.startswith({str(clone)!r})\n", "utf-8")
+    session.run(python, str(beside), external=True)

@@ -64,18 +64,22 @@ def write_json(path: Path, content: Any) -> None:
     write_whole(path, lambda file: file.write(text.encode()))
 
 
-def refuse_overwriting(folder: Path, outputs: Iterable[str], inputs: dict[str, Any]) -> None:
-    """Raise `ValueError` where an output in `folder` is also an input file, under any of its names.
+def check_outputs(folder: Path, outputs: Iterable[str], inputs: dict[str, Any]) -> None:
+    """Raise `ValueError` where an output in `folder` cannot be written, or is also an input file.
 
-    `inputs`: the input files, by the argument that names each; None for one not given.
+    `inputs`: the input files, by the argument that names each; None for one not given. An input is
+    known under any of its names.
     """
-    for output in outputs:
-        for argument, path in inputs.items():
-            if path is None or not (folder / output).exists() or not Path(path).exists():
-                continue
-            if (folder / output).samefile(path):
+    place = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
+        raise ValueError(f"--out: {place} is no folder that can be written to")
+    for path in filter(Path.exists, (folder / output for output in outputs)):
+        if not (path.is_file() and os.access(path, os.W_OK)):
+            raise ValueError(f"--out: {path} is no file that can be written over")
+        for argument, given in inputs.items():
+            if given is not None and Path(given).exists() and path.samefile(given):
                 raise ValueError(
-                    f"--out: {folder / output} is the file of {argument}, and would be overwritten"
+                    f"--out: {path} is the file of {argument}, and would be overwritten"
                 )
 
 

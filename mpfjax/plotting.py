@@ -58,7 +58,9 @@ def draw_components(
         if not alive.any():
             continue
         mean, deviation = means[alive, m, index], np.sqrt(variances[alive, m, index])
-        colour, opacity = COLOURS[m % len(COLOURS)], 0.15 + 0.85 * masses[alive, m]
+        colour = COLOURS[m % len(COLOURS)]
+        # Rounding may leave a mass slightly above one.
+        opacity = np.minimum(0.15 + 0.85 * masses[alive, m], 1.0)
         bars = [to_rgba(colour, 0.4 * alpha) for alpha in opacity]
         dots = [to_rgba(colour, alpha) for alpha in opacity]
         low, high = mean - 2 * deviation, mean + 2 * deviation

@@ -144,6 +144,12 @@ def test_some_frames_of_a_video_without_colours_or_truth(sequence, tmp_path):
     assert frame_files.frame_rate(out / "tracking.mp4") == 12.5
 
 
+def test_the_folder_of_the_results_may_be_a_time(given, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(*given, "--out", "06:47") == 0
+    assert len(list(read_frames(tmp_path / "06:47" / "tracking.mp4"))) == NUM_FRAMES
+
+
 def test_an_interrupt_leaves_what_was_done(given, tmp_path, monkeypatch, capsys):
     """Before the first frame, also the files of an older run."""
     read = frame_files.read_frames
@@ -300,14 +306,19 @@ def test_bad_arguments_are_named_before_anything_is_written(
         ("other.mp4", ["--detect"], "tracking.mp4 is the file of SOURCE"),
         ("img", ["--detections", "out/tracks.txt"], "tracks.txt is the file of --detections"),
         ("img", ["--detect", "--truth", "out/tracks.txt"], "tracks.txt is the file of --truth"),
+        ("img", ["--detect", "--out", "other.mp4"], "other.mp4 is no folder"),
+        ("img", ["--detect", "--out", "other.mp4/deep/within"], "other.mp4 is no folder"),
+        ("img", ["--detect", "--out", "taken"], "taken/summary.json is no file"),
     ],
 )
 def test_files_that_will_not_do_are_named_in_a_line_and_not_written_over(
     tmp_path, capsys, monkeypatch, source, options, named
 ):
     monkeypatch.chdir(tmp_path)
-    for folder in ("out", "img", "empty"):
-        (tmp_path / folder).mkdir()
+    for folder in ("out", "img", "empty", "taken/summary.json"):
+        (tmp_path / folder).mkdir(parents=True)
+    if "--out" in options:  # before the work
+        monkeypatch.setattr(command_loop, "_track", None)
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "img" / "1.png")
     (tmp_path / "out" / "tracking.mp4").write_bytes(b"a video")
     (tmp_path / "out" / "tracks.txt").write_text("1,1,2,2,5,5\n")

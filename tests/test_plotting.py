@@ -1,5 +1,6 @@
 """What figures show: the moments of components."""
 
+import equinox as eqx
 import jax
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -31,3 +32,11 @@ def test_components_stand_where_their_moments_are():
         assert any(np.allclose(bar, expected, rtol=1e-3) for bar in bars)
     living = jax.vmap(lambda mixture: mixture.active)(mixtures)
     assert len(bars) == np.sum(living)
+
+
+def test_a_mass_that_rounding_left_above_one_is_drawn():
+    filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 10)
+    mixtures = mpfjax.run_filter(jax.random.key(0), filter, np.ones(2, np.float32)).collected
+    mixtures = eqx.tree_at(lambda m: m.log_weights, mixtures, mixtures.log_weights + 1e-6)
+    assert np.all(jax.vmap(lambda mixture: mixture.mixture_weights)(mixtures) > 1)
+    assert draw_components(mixtures).axes[0].collections

@@ -31,7 +31,7 @@ from benchmarks.harness import Count, Natural, Seed, command, data, table
 from benchmarks.visual_tracking.detected import follow_detected, make_mixtures, rows_of_tracks
 from benchmarks.visual_tracking.pictures import NAMES, write_contact_sheet, write_video
 from benchmarks.visual_tracking.source import Source, open_source
-from mpfjax.console import refuse_overwriting
+from mpfjax.console import check_outputs
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import BackgroundSubtraction, write_tracks
 from mpfjax.vision.boxes import recipes
@@ -76,7 +76,7 @@ def main(
         raise ValueError("one of --sequence and --video, and of --box, --ids and --detect")
     span = parse_range(frames, "--frames")
     if video is not None:
-        refuse_overwriting(out, ["tracking.mp4"], {"--video": video})
+        check_outputs(out, ["tracking.mp4"], {"--video": video})
     source = open_source(sequence, video, span, seed, box, ids, detect)
     keys = jax.random.split(jax.random.key(seed), seeds)
     runs, source = (detected_runs if detect else drawn_runs)(preset, source, keys)

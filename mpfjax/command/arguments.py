@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpfjax.console import finite, positive, refuse_overwriting, seed, whole
+from mpfjax.console import check_outputs, finite, positive, seed, whole
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import frames
 from mpfjax.vision.files.sequences import (
@@ -153,7 +153,7 @@ def open_source(options: argparse.Namespace) -> Source:
     path, has_pixels = options.source, _has_pixels(options.source)
     detections = options.detections if has_pixels else _detections_alone(options)
     written = [name for name in OUTPUTS if name != VIDEO or (has_pixels and not options.no_video)]
-    refuse_overwriting(
+    check_outputs(
         options.out,
         written,
         {"SOURCE": path, "--detections": detections, "--truth": options.truth},

@@ -32,7 +32,8 @@ class AbstractStateSpaceModel(eqx.Module):
     are missing, and its likelihood must use the values that are there.
 
     A model may also define `log_transition(states, previous_states)`, log D of each particle, shape
-    (n,). Guided proposals need it; the bootstrap proposal does not.
+    (n,), and `log_initial(states)`, log p(x_0). Guided proposals, smoothers and scores need the
+    first, `exact.grid_filter` and particle Gibbs with a prior the second, a bootstrap filter none.
 
     A class may set `periods`, in the form of one state: those of numbers that go round, as angles
     do, and zero for all others. Recipes of mixtures then group particles on the circle.

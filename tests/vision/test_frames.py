@@ -40,6 +40,19 @@ def test_images_come_in_natural_order_without_hidden_companions(tmp_path):
     assert num_images(tmp_path) == len(names)
 
 
+@pytest.mark.parametrize("ending", ["jpg", "png", "tif", "tiff", "webp"])
+def test_an_image_is_turned_as_its_file_says(tmp_path, ending):
+    """As OpenCV does, on which detectors run."""
+    still = np.zeros((32, 48, 3), np.uint8)
+    still[:16, :24] = 200
+    image, exif = Image.fromarray(still), Image.Exif()
+    exif[0x0112] = 6  # a camera held upright: to be turned by a quarter
+    image.save(tmp_path / f"1.{ending}", exif=exif)
+    (frame,) = read_frames(tmp_path)
+    assert frame.shape == (48, 32, 3)
+    assert np.abs(frame - np.rot90(still, -1).astype(float)).mean() < 5
+
+
 def at_times(path, times, stills):
     """A video whose frames are at these multiples of 1/600 s."""
     av = pytest.importorskip("av", reason="the extra 'video' is missing")
@@ -97,6 +110,16 @@ def test_a_video_comes_back(tmp_path, ending):
     back = np.stack(list(read_frames(path, 2, 5))).astype(int)
     assert back.shape == (4, 32, 48, 3)
     assert np.abs(back - shades(6)[1:5]).max() <= 8
+
+
+@pytest.mark.parametrize("name", ["cam:1.mp4", "2026-11-27T06:47:01.mp4", "06:47/a b%20c.mp4"])
+def test_a_path_with_a_colon_is_a_path(tmp_path, monkeypatch, name):
+    """To FFmpeg the words before it are else a protocol."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    write_video(name, iter(shades(3)))
+    assert len(list(read_frames(name))) == 3
+    assert frame_rate(name) == 10.0
 
 
 @pytest.mark.parametrize("name", ["broken.mp4", "broken.gif", "img/000001.png"])

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from mpfjax.checks import Count, Positive, checked, optional, warn
 from mpfjax.vision.files.sequences import read_sequence_info
 
-_IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
+_IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 # The folder of images in a sequence; MOTChallenge's is the second.
 _INNER = ("img", "img1")
 # In half to .7 of the time of the preset "fast" at rate 20, with the same quality to .1 dB, in
@@ -30,8 +30,8 @@ def read_frames(
 
     `path` is a video file, a folder of images in the natural order of their names (2.png before
     10.png), or a folder with such a folder `img` or `img1`. All frames of a video are read,
-    whatever the time between them, rotated as the file says. A `RuntimeWarning` names those that
-    are too damaged to be decoded. Raises `ImportError` if PyAV is missing for a video,
+    whatever the time between them; both are rotated as the file says. A `RuntimeWarning` names
+    those that are too damaged to be decoded. Raises `ImportError` if PyAV is missing for a video,
     `FileNotFoundError` where there is nothing, and `ValueError` with `path` if it cannot be read,
     has no frames, or has frames of different sizes, and for `first` and `last` that are no range.
     """
@@ -123,7 +123,7 @@ def open_video(
             height, width, _ = frame.shape
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             if stream is None:
-                file = opened.enter_context(library.open(str(path), "w"))
+                file = opened.enter_context(library.open(_url(path), "w"))
                 stream = file.add_stream("libx264", rate=rate, options=_X264)
                 stream.height, stream.width, stream.pix_fmt = *frame.shape[:2], "yuv420p"
                 stream.codec_context.thread_count = 0  # one for each processor
@@ -174,13 +174,14 @@ def _natural(path: Path) -> tuple[list[Any], str]:
 
 
 def _read_images(folder: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     paths = _image_paths(folder)
     if first > len(paths):
         raise ValueError(f"{folder}: holds {len(paths)} images, frame {first} is not among them")
     for path in paths[first - 1 : last]:
-        with _naming(path, "an image"), Image.open(path) as image:
+        with _naming(path, "an image"), Image.open(path) as opened:
+            image = ImageOps.exif_transpose(opened)
             if image.mode.startswith("I"):  # 16 bits of grey
                 image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
             frame = np.array(image.convert("RGB"))
@@ -220,12 +221,17 @@ def _decoded(path: Path) -> Iterator[Any]:
         warn(f"{path}: some frames are damaged, and were left out")
 
 
+def _url(path: str | Path) -> str:
+    """A path as FFmpeg reads it, to which the words before a colon are else a protocol."""
+    return f"file:{path}"
+
+
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """A video file and its first stream of frames."""
     library = optional("av", "av")
     with _naming(path, "a video"):
-        container = library.open(str(path))
+        container = library.open(_url(path))
     with container:
         if not container.streams.video:
             raise ValueError(f"{path}: cannot be read as a video (it holds no frames)")
