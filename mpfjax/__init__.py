@@ -32,6 +32,7 @@ from mpfjax.models.multi_object import PairwiseRepulsion as PairwiseRepulsion
 from mpfjax.models.observations import Series as Series
 from mpfjax.models.quadratic import QuadraticModel as QuadraticModel
 from mpfjax.models.trial import check_model as check_model
+from mpfjax.models.trial import simulate as simulate
 from mpfjax.moves.base import AbstractMarkovMove as AbstractMarkovMove
 from mpfjax.moves.base import AbstractMove as AbstractMove
 from mpfjax.moves.base import AbstractPropagation as AbstractPropagation

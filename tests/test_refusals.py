@@ -219,7 +219,7 @@ def test_every_public_call_is_tried():
     assert others == {
         "FilterRun", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
-        "NetworkProposal", "keep_programs", "check_model", "map_moves",
+        "NetworkProposal", "keep_programs", "check_model", "simulate", "map_moves",
     }  # fmt: skip
 
 

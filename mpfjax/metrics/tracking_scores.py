@@ -120,7 +120,8 @@ def matches(boxes: np.ndarray, objects: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     shares = overlap(boxes, objects)
     shares[shares < 0.5 - _ROUNDING] = 0
-    # The objects come first, as in TrackEval: of equal sums it then finds the same.
+    # TrackEval's own solver, with the objects first as there: of equal sums it finds the same. That
+    # of `set_distances`, inside a program, would compile for each number of boxes.
     owners, matched = linear_sum_assignment(-shares.T)
     real = shares[matched, owners] > 0
     return matched[real], owners[real]

@@ -79,19 +79,6 @@ class AbstractStateSpaceModel(eqx.Module):
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """log L(y_t | x_t) of every particle, up to a constant shared by all of them."""
 
-    def simulate(
-        self, key: Key[Array, ""], num_steps: int, *, inputs: PyTree = None
-    ) -> tuple[PyTree, PyTree]:
-        """Draw x_0, ..., x_t, leaves (t + 1, ...), and y_1, ..., y_t, leaves (t, ...).
-
-        The model defines `sample_observation(key, states)`, y given each of n states; it raises
-        `ValueError` otherwise. `inputs` are as for `run_filter`. Use it to test a filter on data
-        whose states are known.
-        """
-        from mpfjax.models.trial import simulate
-
-        return simulate(key, self, num_steps, inputs)
-
 
 def takes_inputs(model: Any) -> bool:
     """Whether a model takes u_t: it has a field `inputs`, or its own `with_inputs`."""

@@ -146,14 +146,6 @@ class MultiObjectModel(AbstractStateSpaceModel):
             return getattr(self, f"_{name}")
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
-    def simulate(
-        self, key: Key[Array, ""], num_steps: int, *, inputs: PyTree = None
-    ) -> tuple[PyTree, PyTree]:
-        """As of any model; a `ValueError` with an interaction, which cannot be simulated."""
-        if self.interaction is not None:
-            raise ValueError("interaction: a model with one gives weights, and cannot be simulated")
-        return super().simulate(key, num_steps, inputs=inputs)
-
     def _sample_observation(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """The observation of every object, leaves (n, J, ...)."""
         if self.shared_observation:

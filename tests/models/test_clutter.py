@@ -145,7 +145,7 @@ def test_chances_and_densities_may_be_functions_and_measurements_trees_of_one_pa
 def test_what_needs_a_single_measurement_is_refused():
     for missing, make in (
         ("observation_mean", lambda: mpfjax.GaussNewtonProposal(MODEL)),
-        ("sample_observation", lambda: MODEL.simulate(KEY, 2)),
+        ("sample_observation", lambda: mpfjax.simulate(KEY, MODEL, 2)),
     ):
         with pytest.raises(ValueError, match=f"ClutteredModel.* {missing}"):
             make()
