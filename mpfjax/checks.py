@@ -14,9 +14,11 @@ own classes; `| None` adds None. Any other annotation is for readers alone.
 """
 
 import contextlib
+import difflib
 import functools
 import importlib
 import inspect
+import linecache
 import math
 import sys
 import traceback
@@ -25,6 +27,7 @@ import typing
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, ParamSpec, TypeGuard, TypeVar
 
 import equinox as eqx
@@ -38,6 +41,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _INNER = ("mpfjax.", "equinox.", "jaxtyping.", "contextlib")  # modules that users need not see
+_JAX = ("jax", "jaxlib", "numpy")
 _LONGEST = 200
 _MOST = 2**31 - 1
 # Of the largest entry of a covariance, which rounding may change by this much.
@@ -126,10 +130,11 @@ def check_shape(shape: str, /, **arguments: Any) -> None:
     kind: Any = jaxtyping.Shaped[Any, shape]
     for name, value in arguments.items():
         with jaxtyping.jaxtyped("context"):
-            if not (_has_numbers(value) and isinstance(value, kind)):
-                found = getattr(value, "shape", shown(value))
-                axes = ", ".join(shape.split())
-                raise ValueError(f"{name}: shape {found} is not ({axes}), that of numbers")
+            axes = ", ".join(shape.split())
+            if not _has_numbers(value):
+                raise ValueError(f"{name}: {shown(value)} is no array of numbers, ({axes})")
+            if not isinstance(value, kind):
+                raise ValueError(f"{name}: shape {value.shape} is not ({axes})")
 
 
 def to_rows(width: int, name: str, value: Any) -> np.ndarray:
@@ -153,7 +158,8 @@ def kinds(tree: Any) -> str:
     """The types and shapes of a tree's arrays, and its structure, to be compared and shown."""
     leaves, structure = jax.tree.flatten(tree)
     each = [f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}" for leaf in leaves]
-    return f"{', '.join(each)} in {structure}"
+    is_array = jax.tree_util.treedef_is_leaf(structure)
+    return ", ".join(each) + f" in {structure}" * (not is_array)
 
 
 def check_one_each(number: int, of_what: str = "particles", /, **trees: Any) -> None:
@@ -174,6 +180,8 @@ class Rule:
 
     holds: Callable[[Any], Any]
     what: str
+    way_out: Callable[[Any], str] = lambda value: ""
+    """what to write instead of a value, if anything is to be said about it."""
 
     def __repr__(self) -> str:
         return self.what
@@ -181,8 +189,10 @@ class Rule:
     def check(self, value: Any, name: str) -> None:
         """Raise a `ValueError` for another value, by the argument's name."""
         if not self.holds(value):
-            hint = f"; write {value.__name__}(...)" if isinstance(value, type) else ""
-            raise ValueError(f"{name}: {shown(value)} is not {self.what}{hint}")
+            way_out = f"write {value.__name__}(...)" if isinstance(value, type) else ""
+            way_out = way_out or self.way_out(value)
+            said = f"{name}: {shown(value)} is not {self.what}"
+            raise ValueError(f"{said}; {way_out}" if way_out else said)
 
 
 def number(holds: Callable[[Any], Any], what: str) -> Rule:
@@ -271,6 +281,11 @@ def check(hint: Any, what: str = "", /, **arguments: Any) -> None:
 class Checked(eqx.Module):
     """A base of classes whose fields are checked by their annotations."""
 
+    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
+        """Raise a `TypeError` for arguments that its `__init__` does not take."""
+        _bound(cls.__init__, (None, *args), kwargs)
+        return super().__new__(cls)
+
     def __check_init__(self) -> None:
         for name, rule in _rules(type(self)).items():
             rule.check(getattr(self, name), name)
@@ -299,21 +314,59 @@ class Fitting(Checked):
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
     """The function, with its arguments checked by their annotations before it runs."""
-    signature = inspect.signature(function)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> R:
-        values = signature.bind(*args, **kwargs).arguments
-        for name, rule in _rules(function).items():
-            if name in values:
-                rule.check(values[name], name)
         try:
+            values = _bound(function, args, kwargs)
+            for name, rule in _rules(function).items():
+                if name in values:
+                    rule.check(values[name], name)
             return function(*args, **kwargs)
         except Exception as error:
             error.__traceback__ = _outside(error.__traceback__)
             raise
 
     return call
+
+
+def _bound(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of a call by name; a `TypeError` that says which of them are amiss."""
+    signature = _signature(function)
+    try:
+        return signature.bind(*args, **kwargs).arguments
+    except TypeError as error:
+        said = _misfit(signature, args, kwargs) or str(error)
+    who = function.__qualname__.rpartition("<locals>.")[2].removesuffix(".__init__")
+    raise TypeError(f"{who}: {said}")
+
+
+_signature = functools.cache(inspect.signature)
+
+
+def _misfit(signature: inspect.Signature, args: tuple[Any, ...], kwargs: dict[str, Any]) -> str:
+    """What is amiss with the arguments of a call; nothing where it is something else."""
+    parameters = [each for name, each in signature.parameters.items() if name != "self"]
+    args = args["self" in signature.parameters :]
+    by_place = [each.name for each in parameters if each.kind is not each.KEYWORD_ONLY]
+    names, given = [each.name for each in parameters], {*by_place[: len(args)], *kwargs}
+    free = [name for name in names if name not in given]
+    for unknown in kwargs.keys() - names:
+        close = difflib.get_close_matches(unknown, free, 1)
+        said = f"did you mean {close[0]}?" if close else f"it takes {', '.join(names)}"
+        return f"{unknown} is none of its arguments; {said}"
+    if len(args) > len(by_place):
+        by_name = ", ".join(names[len(by_place) :])
+        return f"{len(args)} arguments without a name; it takes {', '.join(by_place)}" + (
+            f", and by name {by_name}" if by_name else ""
+        )
+    missing = [each.name for each in parameters if each.name in free and each.default is each.empty]
+    # Without it, what follows has come in its place.
+    if missing and names[0] in ("key", "keys") and not (args and is_key(args[0])):
+        made = "split(jax.random.key(0), runs)" if names[0] == "keys" else "key(0)"
+        return f"{names[0]} is missing, the first argument, as jax.random.{made}"
+    is_or_are = "is" if len(missing) == 1 else "are"
+    return f"{', '.join(missing)} {is_or_are} missing" if missing else ""
 
 
 # By class: the rule for an argument of it, where it need not be an instance.
@@ -368,12 +421,31 @@ def _rule(hint: Any) -> Rule | None:
     if hint is types.NoneType:
         return Rule(lambda value: value is None, "None")
     if getattr(hint, "dtype", None) is jaxtyping.Key:
-        made = "split(jax.random.key(0), runs)" if hint.dims else "key(0)"
-        has_keys = lambda value: isinstance(value, hint) and value.size > 0  # noqa: E731
-        return Rule(has_keys, f"of typed keys, as jax.random.{made}")
+        return _keys(hint)
     if hint in RULES:
         return RULES[hint]
     return _instance(hint) if isinstance(hint, type) and _is_ours(hint) else None
+
+
+def _keys(kind: Any) -> Rule:
+    """The rule for one typed key, or for a row of them."""
+
+    def way_out(value: Any) -> str:
+        is_array = isinstance(value, jax.Array | np.ndarray)
+        if is_array and value.dtype == np.uint32 and value.shape[-1:] == (2,):
+            return "jax.random.key(0) makes typed keys, and jax.random.PRNGKey others"
+        if is_key(value) and not kind.dims:
+            return f"mpfjax.monte_carlo runs a filter for each of {value.size} keys"
+        return ""
+
+    what = "a row of typed keys, as jax.random.split(jax.random.key(0), runs)"
+    what = what if kind.dims else "one typed key, as jax.random.key(0)"
+    return Rule(lambda value: isinstance(value, kind) and value.size > 0, what, way_out)
+
+
+def is_key(value: Any) -> bool:
+    """Whether it is a typed key, or an array of them."""
+    return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
 
 
 def _instance(kind: type) -> Rule:
@@ -390,13 +462,48 @@ def optional(module: str, package: str) -> types.ModuleType:
 
 
 @contextlib.contextmanager
-def saying(what: str) -> Iterator[None]:
-    """Add to an error from the user's own function the argument that it came from."""
+def saying(who: str, given: str = "") -> Iterator[None]:
+    """Have an error of the user's own function begin with its name, what it is given, and the line.
+
+    Errors keep their type. `given` is a clause, as "given a key".
+    """
     try:
         yield
     except Exception as error:
-        error.add_note(f"mpfjax: {what}")
+        said = "".join(f"{part}, " for part in (who, _place(error.__traceback__), given) if part)
+        said = f"{said[:-2]}: " + _UNKNOWN_NUMBERS * isinstance(error, _OF_TRACERS)
+        if len(error.args) == 1 and isinstance(error.args[0], str):
+            error.args = (said + error.args[0],)
+        else:  # it makes its text of other things
+            error.add_note(said)
         raise
+
+
+_OF_TRACERS = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+_UNKNOWN_NUMBERS = (
+    "Python or numpy asks here for numbers that JAX knows only as the program runs; write jnp.where"
+    " in place of `if`, and jax.numpy in place of numpy\n"
+)
+
+
+def _place(raised: types.TracebackType | None) -> str:
+    """The line of the user's own code that raised, and its text; nothing where it is not theirs."""
+    lines = [at for at in traceback.walk_tb(raised) if not _module_of(at[0]).startswith(_INNER)]
+    # What it calls may be of JAX, or of another library.
+    root = _module_of(lines[0][0]).partition(".")[0] if lines else ""
+    if not lines or root in _JAX:
+        return ""
+    frame, line = [at for at in lines if _module_of(at[0]).partition(".")[0] == root][-1]
+    path = frame.f_code.co_filename
+    return f"line {line} of {Path(path).name}, `{linecache.getline(path, line).strip()}`"
+
+
+def _module_of(frame: types.FrameType) -> str:
+    return frame.f_globals.get("__name__", "")
 
 
 def _outside(found: types.TracebackType | None) -> types.TracebackType | None:
@@ -404,14 +511,14 @@ def _outside(found: types.TracebackType | None) -> types.TracebackType | None:
     kept = None
     for frame, line in reversed(list(traceback.walk_tb(found))):
         is_shown = kept is None or getattr(jax.config, "jax_traceback_filtering", "") == "off"
-        if is_shown or not frame.f_globals.get("__name__", "").startswith(_INNER):
+        if is_shown or not _module_of(frame).startswith(_INNER):
             kept = types.TracebackType(kept, frame, frame.f_lasti, line)
     return kept
 
 
 def warn(said: str, category: type[Warning] = RuntimeWarning) -> None:
     """Warn at the line outside of the library from which it was called."""
-    names = [at.f_globals.get("__name__", "") for at, _ in traceback.walk_stack(sys._getframe())]
+    names = [_module_of(at) for at, _ in traceback.walk_stack(sys._getframe())]
     last = max(depth for depth, name in enumerate(names) if name.startswith("mpfjax."))
     caller = next(k for k, name in enumerate(names) if k > last and not name.startswith(_INNER))
     warnings.warn(said, category, stacklevel=caller + 1)
@@ -419,6 +526,7 @@ def warn(said: str, category: type[Warning] = RuntimeWarning) -> None:
 
 def shown(value: Any) -> str:
     """The value on one line, cut where it is long; arrays of ten numbers or more as shapes."""
-    is_short = isinstance(value, jax.Array | np.ndarray) and value.size < 10
+    is_array = isinstance(value, jax.Array | np.ndarray) and not isinstance(value, Tracer)
+    is_short = is_array and value.size < 10 and not is_key(value)
     text = " ".join((str(value) if is_short else eqx.tree_pformat(value, width=_MOST)).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."

@@ -461,7 +461,7 @@ REFUSED = (
     ("mixtures: these are not all", lambda: paths(HISTORY.final)),
     (r"mixtures: \[ParticleMixture\(particles=f32\[4\], .* is not", lambda: paths([MIXTURE])),
     (r"q: 90 is not in \[0, 1\]", lambda: MIXTURE.quantile(MIXTURE.particles, 90)),
-    (r"trajectory: float32\[4\] .* is not float32\[3\]", lambda: around(trajectory=np.ones(4))),
+    (r"trajectory: float32\[4\] is not float32\[3\]", lambda: around(trajectory=np.ones(4))),
     *(
         (f"filter: .*{words}", lambda filter=filter: around(filter))
         for words, filter in (
@@ -504,10 +504,90 @@ def test_what_is_refused_for_another_reason(words, call):
         call()
 
 
-def test_an_error_within_the_likelihood_says_what_it_was_given():
-    with pytest.raises(TypeError) as caught:
-        FILTER.step(KEY, MIXTURE, {"y": 1.0})
-    assert any("log_likelihood" in note and "'y'" in note for note in caught.value.__notes__)
+# What a first user writes by mistake, and how the message begins.
+MISTAKEN = (
+    ("mixture_particle_filter: max_componets is none of .*; did you mean max_components",
+     lambda: mpfjax.mixture_particle_filter(MODEL, 20, max_componets=2)),
+    ("mixture_particle_filter: allocation is none of .*; it takes model, num_particles, max_",
+     lambda: mpfjax.mixture_particle_filter(MODEL, 20, 2, allocation="equal")),
+    ("mixture_particle_filter: max_components is missing",
+     lambda: mpfjax.mixture_particle_filter(MODEL, 20)),
+    ("Resample: ess_treshold is none of .*; did you mean ess_thr",
+     lambda: Resample(ess_treshold=0.5)),
+    ("Filter: num_component is none of .*; did you mean num_components",
+     lambda: Filter(MODEL, [Propagate(MODEL)], 4, num_component=1)),
+    ("LinearGaussianModel: m0, P0 are missing",
+     lambda: mpfjax.LinearGaussianModel(EYE, EYE, EYE, EYE)),
+    ("run_filter: 6 arguments without a name; it takes key, .*, and by name inputs, missing",
+     lambda: mpfjax.run_filter(KEY, FILTER, TWO, None, None, "skip")),
+    ("smoothed_sums: missing is none of", lambda: smoothing.smoothed_sums(
+        **FILTERED, function=difference, missing="skip")),
+    ("run_filter: key is missing", lambda: mpfjax.run_filter(FILTER, TWO)),
+    ("Filter.init: key is missing", lambda: FILTER.init()),
+    (r"monte_carlo: keys is missing, .* jax.random.split\(",
+     lambda: mpfjax.monte_carlo(FILTER, TWO)),
+    (r"key: key<fry>\[3\] is not one .*; mpfjax.monte_carlo runs a filter for each of 3 keys",
+     lambda: mpfjax.run_filter(jax.random.split(KEY, 3), FILTER, TWO)),
+    (r"keys: key<fry>\[\] is not a row of .* jax.random.split\(",
+     lambda: mpfjax.monte_carlo(KEY, FILTER, TWO)),
+    (r"key: \[0 0\] .*; jax.random.key\(0\) makes typed",
+     lambda: mpfjax.run_filter(jax.random.PRNGKey(0), FILTER, TWO)),
+    ("model: Still defines no sample_transition, nor transition_from_noise",
+     lambda: mpfjax.particle_filter(Still(), 4)),
+    ("model: Plain defines no sample_initial, which a filter needs; is sample_prior meant",
+     lambda: mpfjax.particle_filter(Plain(), 4)),
+    ("model: a Filter is no model, and holds one", lambda: mpfjax.particle_filter(FILTER, 4)),
+    ("model: a Filter is no model, and holds one", lambda: Propagate(FILTER)),
+    (r"features: shape \(3,\) is not \(20, ...\)", lambda: run(mpfjax.mixture_particle_filter(
+        MODEL, 20, 2, features=lambda states: states[:3]))),
+    (r"features: \(f32\[20\], .* is no array of numbers", lambda: run(
+        mpfjax.mixture_particle_filter(MODEL, 20, 2, features=lambda states: (states, states)))),
+    (r"features, line \d+ of test_refusals.py, .*: .* has no attribute.* place",
+     lambda: run(mpfjax.mixture_particle_filter(MODEL, 20, 2, features=lambda x: x.place))),
+    (r"model: QuadraticModel.log_likelihood, given .* in a list: jnp.asarray\(observations\) is",
+     lambda: run(FILTER, [TWO, TWO, TWO])),
+    (r"model: LinearGaussianModel.log_likelihood, .*: observation: shape \(2,\) is not \(1\)",
+     lambda: run_of(mpfjax.LinearGaussianModel(**LINEAR), np.ones((3, 2)))),
+    (r"observations: NaN or infinite at index 1 of the leading axis; Series.skipping\(",
+     lambda: smoothing.smoothed_sums(KEY, FILTER, np.array([1.0, NAN]), difference)),
+    (r"model: Changed.log_likelihood, line \d+ of test_refusals.py, `if states\[0\] > 0:`, given"
+     r" the observation f32\[\]: .*jnp.where", lambda: run_of(
+         changed(Batched, log_likelihood=signed))),
+    (r"model: Changed.sample_transition, line \d+ of test_refusals.py, `return np.exp\(states\)`: "
+     ".*jax.numpy", lambda: run_of(changed(Batched, sample_transition=exponential))),
+    (r"model: Changed.log_likelihood, line \d+ .*, given the observation {'y': f32\[\]}",
+     lambda: run_of(changed(Batched), {"y": TWO})),
+)  # fmt: skip
+
+
+class Still(mpfjax.AbstractStateSpaceModel):
+    def sample_initial(self, key, num_particles):
+        return jnp.zeros(num_particles)
+
+    def log_likelihood(self, observation, states):
+        return -((observation - states) ** 2)
+
+
+class Plain:
+    def sample_prior(self, key, num_particles):
+        return jnp.zeros(num_particles)
+
+
+def signed(self, observation, states):
+    if states[0] > 0:
+        return states
+    return -states
+
+
+def exponential(self, key, states):
+    return np.exp(states)
+
+
+@pytest.mark.parametrize(("begins", "call"), MISTAKEN, ids=[words[:40] for words, _ in MISTAKEN])
+def test_a_mistake_is_named_in_the_first_line(begins, call):
+    with pytest.raises((ValueError, TypeError, AttributeError)) as caught:
+        call()
+    assert re.match(begins, str(caught.value).splitlines()[0]), str(caught.value)
 
 
 def test_arrays_become_those_of_jax():

@@ -4,8 +4,10 @@ wrapper for models of one particle.
 
 import abc
 import copy
+import difflib
 import inspect
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import RULES, Count, Rule, check, check_one_each, kinds, shown
+from mpfjax.checks import RULES, Count, Rule, check, check_one_each, kinds, saying, shown
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.random import direction_numbers, normal, split
 
@@ -129,9 +131,14 @@ def require(model: Any, method: str, needed_by: str, argument: str = "model") ->
     """Raise a `ValueError` where `model` lacks `method`, before anything compiles."""
     if isinstance(model, type):
         raise ValueError(f"{argument}: {shown(model)} is a class; write {model.__name__}(...)")
+    if hasattr(model, "initial_moves"):
+        raise ValueError(f"{argument}: a {type(model).__name__} is no model, and holds one, .model")
     if not callable(getattr(model, method, None)):
         who = shown(model) if model is None else model_name(model)
-        raise ValueError(f"{argument}: {who} defines no {method}, which {needed_by} needs")
+        taken = {*_BATCHED, *_SHARED, *vars(AbstractStateSpaceModel)}
+        close = difflib.get_close_matches(method, vars(type(_own(model))).keys() - taken, 1)
+        hint = f"; is {close[0]} meant for it?" if close else ""
+        raise ValueError(f"{argument}: {who} defines no {method}, which {needed_by} needs{hint}")
 
 
 _FROM_NOISE = AbstractStateSpaceModel.sample_transition
@@ -140,6 +147,14 @@ _FROM_NOISE = AbstractStateSpaceModel.sample_transition
 def model_name(model: Any) -> str:
     """The name of the user's own class, whether `per_particle` wraps it or not."""
     return type(_own(model)).__name__
+
+
+def asking(model: Any, method: str, given: str = "") -> AbstractContextManager[None]:
+    """A block that calls a method of the model, whose errors say so, and what it was given."""
+    clauses = [f"given {given}"] if given else []
+    if getattr(model, "inputs", ()) is None and not type(model).__module__.startswith("mpfjax."):
+        clauses.append("its inputs None, as no u_t is given by inputs= or a Series")
+    return saying(f"model: {model_name(model)}.{method}", ", ".join(clauses))
 
 
 def _own(model: Any) -> Any:
@@ -157,11 +172,14 @@ class _ModelRule(Rule):
 
     def check(self, value: Any, name: str) -> None:
         """Raise a `ValueError` that says what is missing."""
-        law, needed_by = "sample_transition", "a filter"
+        law = "sample_transition"
         if getattr(type(value), law, None) is _FROM_NOISE and not hasattr(value, "latent_dynamics"):
-            law, needed_by = "transition_from_noise", "a model without sample_transition"
+            law = "transition_from_noise"
+            if not hasattr(value, law):
+                who = f"{name}: {model_name(value)} defines no sample_transition"
+                raise ValueError(f"{who}, nor {law}, one of which a filter needs")
         for method in ("sample_initial", law, "log_likelihood"):
-            require(value, method, needed_by, name)
+            require(value, method, "a filter", name)
         try:
             inspect.signature(value.sample_initial).bind("key", "num_particles")
         except TypeError as error:

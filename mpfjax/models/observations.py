@@ -161,7 +161,7 @@ def present_steps(observations: PyTree, series: Series, takes_nan: bool) -> Any:
             seen = _steps_where(observations, "any", lambda numpy, leaf: ~numpy.isnan(leaf))
         present = present & seen
     what = "infinite" if takes_nan else "NaN or infinite"
-    hint = "" if takes_nan else "; missing='skip', or Series.skipping, takes them as missing"
+    hint = "" if takes_nan else "; Series.skipping(observations) takes them as missing"
     present = _refused_where(present & ~usable, present, f"observations: {what}", hint)
     return None if numpy is np and present.all() else jnp.asarray(present)
 

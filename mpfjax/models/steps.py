@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import kinds, saying
+from mpfjax.checks import shown
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models import gaussians
-from mpfjax.models.base import check_log_density, check_moved, model_name
+from mpfjax.models.base import asking, check_log_density, check_moved
 from mpfjax.models.conditionally_linear import (
     emission_of,
     is_marginalised,
@@ -40,16 +40,10 @@ def drawn(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:
     if is_mixed(model):
         noise = normal(key, before.shape, noise_dtype(states))
         return latent_from_noise(model, noise, states)
-    with saying(f"in {_asked(model, 'sample_transition')}"):
+    with asking(model, "sample_transition"):
         draws = model.sample_transition(key, before)
     check_moved(draws, before, model)
     return draws
-
-
-def _asked(model: Any, method: str) -> str:
-    """The method's name for a note, and whether the model's `inputs` are missing."""
-    missing = ", whose `inputs` are None: give u_t as inputs=, or in a Series"
-    return f"model: {model_name(model)}.{method}" + missing * (getattr(model, "inputs", ()) is None)
 
 
 def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
@@ -57,8 +51,7 @@ def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
     before = drawn_part(model, states)
     if is_mixed(model):
         return latent_from_noise(model, noise, states)
-    who = _asked(model, "transition_from_noise")
-    with saying(f"in {who}, of noise of shape {noise.shape}, as noise_dimension says"):
+    with asking(model, "transition_from_noise", f"noise {noise.shape}, as noise_dimension says"):
         draws = model.transition_from_noise(noise, before)
     check_moved(draws, before, model, "transition_from_noise")
     return draws
@@ -85,7 +78,7 @@ def log_transition(model: Any, draws: PyTree, states: PyTree) -> Float[Array, " 
     """log D of what was drawn of x_t, given x_{t-1}, checked."""
     if is_mixed(model):
         return log_latent_density(model, draws, states)
-    with saying(f"in {_asked(model, 'log_transition')}"):
+    with asking(model, "log_transition"):
         values = model.log_transition(draws, drawn_part(model, states))
     num_particles = jax.tree.leaves(draws)[0].shape[0]
     return check_log_density(values, model, "log_transition", num_particles)
@@ -112,8 +105,9 @@ def seen(
 
 def own_likelihoods(model: Any, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
     """The model's own `log_likelihood`, of a latent without what is seen of x, checked."""
-    who = _asked(model, "log_likelihood")
-    with saying(f"in {who}, of a step of the observations that is {kinds(observation)}"):
+    is_list = isinstance(observation, list)
+    hint = ", one number of each array in a list: jnp.asarray(observations) is one array" * is_list
+    with asking(model, "log_likelihood", f"the observation {shown(observation)}{hint}"):
         values = model.log_likelihood(observation, states)
     num_particles = jax.tree.leaves(states)[0].shape[0]
     return check_log_density(values, model, "log_likelihood", num_particles)

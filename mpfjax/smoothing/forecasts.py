@@ -81,7 +81,7 @@ def _forecast(key, filter, mixture, inputs, options):
         observations = None
         if simulate_observation is not None:
             simulate = give_inputs(simulate_observation, filter.model, now)
-            with saying("in simulate_observation, which is called with a key and the particles"):
+            with saying("simulate_observation", "called with a key and the particles"):
                 observations = simulate(key_observation, mixture.particles)
             check_one_each(mixture.num_particles, simulate_observation=observations)
         return mixture, (mixture, observations)

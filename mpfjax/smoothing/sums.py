@@ -248,7 +248,7 @@ class FixedLagSmoother(Checked):
 
     def _of_states(self, previous: PyTree, states: PyTree) -> PyTree:
         """h of these states; a `ValueError` unless it is one value a particle."""
-        with saying("in function, which is called with x_{t-1} and x_t of all particles"):
+        with saying("function", "called with x_{t-1} and x_t of all particles"):
             values = mapped(self.filter.model, self.function)(previous, states)
         check_one_each(jax.tree.leaves(states)[0].shape[0], function=values)
         return jax.tree.map(as_inexact, values)

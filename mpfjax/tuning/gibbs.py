@@ -244,7 +244,7 @@ class _Kernel(AbstractKernel):
         ]
         kept = pair.trajectory
         if self.collect is not None:
-            with saying("in collect, which is called with a trajectory"):
+            with saying("collect", "called with a trajectory"):
                 kept = self.collect(kept)
         report = (pair.reals, kept, accepted, jnp.any(jnp.stack(changes), axis=0))
         return Step(pair, report, accepted, invalid)
@@ -261,7 +261,7 @@ class _Kernel(AbstractKernel):
     def drawn(self, key: Key[Array, ""], reals: Reals, trajectory: PyTree) -> Reals:
         """The user's draw, in unconstrained numbers."""
         filter = self.problem.at(reals)
-        with saying("in draw, which is called with a key, trajectory, observations and model"):
+        with saying("draw", "called with a key, trajectory, observations and model"):
             observations = self.joint.series.observations
             drawn = cast(Draw, self.draw)(key, trajectory, observations, filter.model)
         return self.problem.unconstrain(drawn, "draw")

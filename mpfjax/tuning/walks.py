@@ -100,7 +100,7 @@ def checked_deviations(given: float | Mapping[str, Any], start: Reals) -> Reals:
         raise ValueError(f"proposal_deviations: those of {sorted(by_name)}, not of {sorted(start)}")
     deviations = {}
     for name, u in start.items():
-        with saying(f"in proposal_deviations, of {name}"):
+        with saying(f"proposal_deviations of {name}"):
             deviations[name] = jnp.broadcast_to(jnp.asarray(by_name[name], u.dtype), u.shape)
         POSITIVE.check(deviations[name], f"proposal_deviations: {name}")
     return deviations

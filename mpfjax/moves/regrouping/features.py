@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from mpfjax.checks import POSITIVE, Checked, to_numbers
+from mpfjax.checks import POSITIVE, Checked, check_shape, saying, to_numbers
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero
 from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread
@@ -41,7 +41,12 @@ class ByFeatures(Checked):
         Regrouping needs only differences, and values far from zero would lose them to rounding.
         """
         particles = mixture.particles
-        values = flatten_states(particles) if self.features is None else self.features(particles)
+        if self.features is None:
+            values = flatten_states(particles)
+        else:
+            with saying("features", "called with the particles"):
+                values = self.features(particles)
+            check_shape(f"{mixture.num_particles} ...", features=values)
         values = as_inexact(values.reshape(mixture.num_particles, -1))
         if len(self.scale) not in (1, values.shape[1]):
             raise ValueError(f"scale: {len(self.scale)} units for {values.shape[1]} features")

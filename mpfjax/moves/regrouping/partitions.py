@@ -94,7 +94,7 @@ class GroupBy(AbstractRegrouping):
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The label of every particle; that of an empty slot is moved into [0, M)."""
         del key
-        with saying("in function, of GroupBy, which is called with the particles"):
+        with saying("function of GroupBy", "called with the particles"):
             labels: Any = self.function(mixture.particles)
         n, dtype = mixture.num_particles, getattr(labels, "dtype", float)
         if dtype == jnp.bool_:

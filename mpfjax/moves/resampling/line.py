@@ -251,7 +251,7 @@ def _coordinates(mixture: ParticleMixture, sort_by: SortBy) -> Array:
             )
         dtype = jnp.result_type(*leaves)
         return jnp.concatenate([leaf.astype(dtype).T for leaf in leaves])
-    with saying("in sort_by, which is called with the particles"):
+    with saying("sort_by", "called with the particles"):
         values: Any = sort_by(mixture.particles)
     if not isinstance(values, jax.Array | np.ndarray) or jnp.iscomplexobj(values):
         raise ValueError(f"sort_by: it returned {shown(values)}, no real array")
