@@ -12,7 +12,6 @@ from mpfjax.checks import as_numbers, checked
 from mpfjax.models.base import with_inputs
 from mpfjax.models.linear import LinearGaussianModel
 from mpfjax.models.observations import Series, gathered, present_steps, steps_of_inputs
-from mpfjax.operations.matrices import cholesky
 
 
 class LinearStep(NamedTuple):
@@ -63,8 +62,9 @@ def kalman_filter(
 ) -> KalmanFilterRun:
     """The Kalman filter (Kalman 1960), with the library's convention: y_1 follows x_1, not x_0.
 
-    Covariances are updated in Joseph's form, which stays positive in float32. Differentiable, and
-    `jax.vmap` maps it over several series.
+    Covariances are factors U diag(D) Uᵀ, and no variance is a difference: in float32 log Z is right
+    to 0.05 up to a diffuse prior of P_0 / R = 1e13. Differentiable, and `jax.vmap` maps it over
+    several series.
 
     - `observations`: an array (t, p), or a `Series` of one.
     - `inputs`: those of the model, controls or matrices that change in time; as for `run_filter`.
@@ -92,12 +92,10 @@ def kalman_smoother(
     After the Kalman filter it goes back from x_t. With (m, P) the filter's moments at s, and (m',
     P') the smoothed ones at s + 1,
 
-        G = P Aᵀ (A P Aᵀ + Q)⁻¹,   mean m + G (m' - A m),   covariance
-        (I - G A) P (I - G A)ᵀ + G (Q + P') Gᵀ,
+        G = P Aᵀ (A P Aᵀ + Q)⁻¹,   mean m + G (m' - A m),   covariance C + G P' Gᵀ,
 
-    a sum of positive terms, which stays positive in float32. Differentiable, and `jax.vmap` maps it
-    over several series. Arguments and errors are those of `kalman_filter`. Use it as the reference
-    for particle smoothers of a linear-Gaussian model.
+    where C is Cov[x_s | x_{s+1}, y_1..y_s]. Precision, derivatives, arguments and errors are those
+    of `kalman_filter`. Use it as the reference for particle smoothers of a linear-Gaussian model.
     """
     return _smooth(model, *_checked(model, observations, inputs, missing))
 
@@ -121,17 +119,24 @@ def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Float[Array
 @eqx.filter_jit
 def _kalman_filter(constant, observations, inputs):
     """Means and covariances of x_1, ..., x_t, and the increments."""
-    start = constant.m0, constant.P0
-    return filtered_moments(start, lambda now: _step_of(constant, now), inputs, observations)
+    laws, increments = filtered(_start(constant), _steps(constant), inputs, observations)
+    return laws.moments, increments
 
 
 @eqx.filter_jit
 def _smooth(constant, observations, inputs):
-    start, filtered = (constant.m0, constant.P0), _kalman_filter(constant, observations, inputs)
-    moments, increments = filtered
-    step_of = lambda now: _step_of(constant, now)  # noqa: E731
-    smoothed, lagged = smoothed_moments(start, moments, step_of, inputs)
-    return KalmanSmootherRun(*smoothed, lagged, jnp.sum(increments))
+    start, step_of = _start(constant), _steps(constant)
+    laws, increments = filtered(start, step_of, inputs, observations)
+    moments, lagged = smoothed(start, laws, step_of, inputs)
+    return KalmanSmootherRun(*moments, lagged, jnp.sum(increments))
+
+
+def _start(constant: LinearGaussianModel) -> "Law":
+    return Law.of(constant.m0, constant.P0)
+
+
+def _steps(constant: LinearGaussianModel) -> StepOf:
+    return lambda now: _step_of(constant, now)
 
 
 def _step_of(constant: LinearGaussianModel, now: PyTree) -> LinearStep:
@@ -142,71 +147,160 @@ def _step_of(constant: LinearGaussianModel, now: PyTree) -> LinearStep:
     return LinearStep(model.A, b, model.Q, model.H, nothing, model.R)
 
 
-def filtered_moments(
-    start: Moments, step_of: StepOf, told: PyTree, observations: Float[Array, "t p"]
-) -> tuple[Moments, Float[Array, " t"]]:
-    """Means and covariances of x_1, ..., x_t, and the increments; a NaN is a missing number.
+class Law(NamedTuple):
+    """N(mean, U diag(D) Uᵀ), with U upper triangular and ones on its diagonal, D >= 0."""
+
+    mean: Float[Array, "*t d"]
+    unit: Float[Array, "*t d d"]
+    variances: Float[Array, "*t d"]
+
+    @classmethod
+    def of(cls, mean: Float[Array, " d"], covariance: Float[Array, "d d"]) -> "Law":
+        """From a covariance, positive semidefinite."""
+        return cls(mean, *_factors(covariance))
+
+    @property
+    def moments(self) -> Moments:
+        """Mean and covariance."""
+        return self.mean, _squared(self.unit, self.variances)
+
+
+def _squared(rows: Float[Array, "*t n k"], variances: Float[Array, "*t k"]) -> Array:
+    """A diag(D) Aᵀ, a sum of terms none of which is negative on the diagonal."""
+    return jnp.einsum("...ik,...k,...jk->...ij", rows, variances, rows)
+
+
+def _factors(covariance: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Float[Array, " d"]]:
+    """U and D of a covariance; a variance that only rounding leaves is zero."""
+    d = covariance.shape[0]
+    least = 4 * d * jnp.finfo(covariance.dtype).eps * jnp.diagonal(covariance)
+
+    def eliminate(rest: Array, j: Array) -> tuple[Array, tuple[Array, Array]]:
+        variance = jnp.where(rest[j, j] > least[j], rest[j, j], 0.0)
+        column = _above(j, _without_zero(rest[:, j], variance))
+        return rest - variance * jnp.outer(column, column), (column, variance)
+
+    _, (columns, variances) = jax.lax.scan(eliminate, covariance, jnp.arange(d), reverse=True)
+    return columns.T + jnp.eye(d, dtype=covariance.dtype), variances
+
+
+def _without_zero(numbers: Array, divisor: Float[Array, ""]) -> Array:
+    """Their ratio, 0 where the divisor is."""
+    is_zero = divisor == 0
+    return jnp.where(is_zero, 0.0, numbers / jnp.where(is_zero, 1.0, divisor))
+
+
+def _above(j: Array, column: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The entries above row j, and zeros."""
+    return jnp.where(jnp.arange(column.shape[0]) < j, column, 0.0)
+
+
+class Regression(NamedTuple):
+    """Rows z on the last m of them: z = (what is left, 0) + unit e, e ~ N(0, diag(variances))."""
+
+    left: Float[Array, "rest k"]
+    unit: Float[Array, "n m"]
+    variances: Float[Array, " m"]
+
+
+def _regression(rows: Float[Array, "n k"], noise: Float[Array, " k"], on: int) -> Regression:
+    """Of z = A w, w ~ N(0, diag(noise)), on the last rows, as many as `on`.
+
+    By the modified Gram-Schmidt method with weights (Thornton and Bierman 1978), from the last row
+    upward: no variance is a difference. Each row is taken off twice, and what rounding alone leaves
+    of an entry counts as zero, so that a small noise is not lost beside a large one.
+    """
+    n, eps = rows.shape[0], jnp.finfo(rows.dtype).eps
+
+    def eliminate(carry: tuple[Array, Array], j: Array) -> tuple[Any, Any]:
+        (rows, sizes), row = carry, carry[0][j]
+        weighted = noise * row
+        variance = jnp.sum(weighted * row)
+
+        def column(rows: Array) -> Array:
+            return _above(j, _without_zero(rows @ weighted, variance))
+
+        share = column(rows)
+        rest = rows - jnp.outer(share, row)
+        sizes = jnp.maximum(sizes, jnp.abs(jnp.outer(share, row)))
+        remains = column(rest)
+        rest = rest - jnp.outer(remains, row)
+        rounding = jnp.where(jnp.abs(rest) <= 4 * eps * sizes, rest, 0.0)
+        # Its derivative stays.
+        rest = rest - jax.lax.stop_gradient(rounding)
+        return (rest, sizes), (share + remains, variance)
+
+    first, carry = n - on, (rows, jnp.abs(rows))
+    (rows, _), (columns, variances) = jax.lax.scan(
+        eliminate, carry, jnp.arange(first, n), reverse=True
+    )
+    unit = columns.T + jnp.eye(n, on, -first, dtype=rows.dtype)
+    return Regression(rows[:first], unit, variances)
+
+
+def filtered(
+    start: Law, step_of: StepOf, told: PyTree, observations: Float[Array, "t p"]
+) -> tuple[Law, Float[Array, " t"]]:
+    """The laws of x_1, ..., x_t, and the increments; a NaN is a missing number.
 
     `step_of` makes the matrices of each step from its part of `told`, which has a leading axis t.
+    (x_t, y_t) is a matrix times independent noises, those of x_{t-1}, of the dynamics and of y_t.
     """
-    identity = jnp.eye(start[0].shape[0], dtype=start[0].dtype)
 
-    def advance(carry: Moments, of_step: tuple[Array, PyTree]) -> tuple[Moments, Any]:
-        (mean, covariance), (observation, now) = carry, of_step
-        step = step_of(now)
-        mean = step.F @ mean + step.b
-        covariance = step.F @ covariance @ step.F.T + step.Q
+    def advance(law: Law, of_step: tuple[Array, PyTree]) -> tuple[Law, Any]:
+        observation, now = of_step
+        step, d = step_of(now), law.mean.shape[0]
         seen = ~jnp.isnan(observation)
         # A missing number becomes one with H = 0, variance one and no error.
         H = jnp.where(seen[:, None], step.H, 0.0)
         R = jnp.where(seen[:, None] & seen[None], step.R, jnp.eye(*step.R.shape, dtype=H.dtype))
+        mean = step.F @ law.mean + step.b
         innovation = jnp.where(seen, observation - step.c, 0.0) - H @ mean
-        factor = jnp.linalg.cholesky(H @ covariance @ H.T + R)
-        white = jax.scipy.linalg.solve_triangular(factor, innovation, lower=True)
-        increment = -0.5 * jnp.sum(white**2) - jnp.sum(jnp.log(jnp.diagonal(factor)))
-        increment -= 0.5 * jnp.sum(seen).astype(mean.dtype) * jnp.log(2 * jnp.pi)
-        gain = jax.scipy.linalg.cho_solve((factor, True), H @ covariance).T
-        left = identity - gain @ H
-        mean = mean + gain @ innovation
-        covariance = left @ covariance @ left.T + gain @ R @ gain.T
-        return (mean, covariance), (mean, covariance, increment)
+        units, variances = _factors(jax.scipy.linalg.block_diag(step.Q, R))
+        moved = jnp.concatenate([step.F @ law.unit, units[:d]], axis=1)
+        of_observation = jnp.pad(units[d:], ((0, 0), (d, 0)))
+        rows = jnp.concatenate([moved, H @ moved + of_observation])
+        noise = jnp.concatenate([law.variances, variances])
+        _, unit, variances = _regression(rows, noise, rows.shape[0])
+        errors, spread = _solve_unit(unit[d:, d:], innovation), variances[d:]
+        increment = -0.5 * jnp.sum(errors**2 / spread + jnp.log(spread))
+        increment -= 0.5 * jnp.sum(seen).astype(H.dtype) * jnp.log(2 * jnp.pi)
+        law = Law(mean + unit[:d, d:] @ errors, unit[:d, :d], variances[:d])
+        return law, (law, increment)
 
-    _, (means, covariances, increments) = jax.lax.scan(advance, start, (observations, told))
-    return (means, covariances), increments
-
-
-def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """The Cholesky factor, in which a direction without variance counts as independent.
-
-    What is multiplied by the inverse has nothing in that direction either, so that any will do.
-    """
-    factor, variances = cholesky(covariance[None])[0], jnp.diagonal(covariance)
-    scales = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
-    return factor + jnp.diag(jnp.where(jnp.diagonal(factor) == 0, scales, 0.0))
+    return jax.lax.scan(advance, start, (observations, told))[1]
 
 
-def smoothed_moments(
-    start: Moments, filtered: Moments, step_of: StepOf, told: PyTree
+def _solve_unit(unit: Float[Array, "m m"], right: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    """U⁻¹ b."""
+    return jax.scipy.linalg.solve_triangular(unit, right, unit_diagonal=True)
+
+
+def smoothed(
+    start: Law, laws: Law, step_of: StepOf, told: PyTree
 ) -> tuple[Moments, Float[Array, "t d d"]]:
-    """Those of x_0, ..., x_t given y_1..y_t, and Cov[x_s, x_{s-1}]."""
-    identity = jnp.eye(start[0].shape[0], dtype=start[0].dtype)
+    """The moments of x_0, ..., x_t given y_1..y_t, and Cov[x_s, x_{s-1}]; `laws` are filtered.
 
-    def back(later: Moments, earlier: tuple[Array, Array, PyTree]) -> tuple[Moments, Any]:
-        (later_mean, later_covariance), (mean, covariance, now) = later, earlier
+    (x_s, x_{s+1}) is a matrix times the noises of x_s and of the dynamics.
+    """
+    d = start.mean.shape[0]
+
+    def back(later: Moments, earlier: tuple[Law, PyTree]) -> tuple[Moments, Any]:
+        (later_mean, later_covariance), (law, now) = later, earlier
         step = step_of(now)
-        predicted = step.F @ covariance @ step.F.T + step.Q
-        gain = jax.scipy.linalg.cho_solve((_root(predicted), True), step.F @ covariance).T
-        left = identity - gain @ step.F
-        mean = mean + gain @ (later_mean - (step.F @ mean + step.b))
-        covariance = left @ covariance @ left.T + gain @ (step.Q + later_covariance) @ gain.T
+        units, variances = _factors(step.Q)
+        rows = jnp.block([[law.unit, jnp.zeros_like(units)], [step.F @ law.unit, units]])
+        noise = jnp.concatenate([law.variances, variances])
+        left, unit, _ = _regression(rows, noise, d)
+        gain = unit[:d] @ _solve_unit(unit[d:], jnp.eye(d, dtype=unit.dtype))
+        mean = law.mean + gain @ (later_mean - (step.F @ law.mean + step.b))
+        covariance = _squared(left, noise) + gain @ later_covariance @ gain.T
         return (mean, covariance), (mean, covariance, later_covariance @ gain.T)
 
-    last = filtered[0][-1], filtered[1][-1]
-    earlier = jax.tree.map(
-        lambda row, rows: jnp.concatenate([row[None], rows[:-1]]), start, filtered
-    )
-    _, (*found, lagged) = jax.lax.scan(back, last, (*earlier, told), reverse=True)
+    last = jax.tree.map(lambda rows: rows[-1], laws.moments)
+    earlier = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows[:-1]]), start, laws)
+    _, (*before, lagged) = jax.lax.scan(back, last, (earlier, told), reverse=True)
     means, covariances = (
-        jnp.concatenate([rows, row[None]]) for rows, row in zip(found, last, strict=True)
+        jnp.concatenate([rows, row[None]]) for rows, row in zip(before, last, strict=True)
     )
     return (means, covariances), lagged

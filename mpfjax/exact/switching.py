@@ -8,11 +8,12 @@ from jaxtyping import Array, Float, Int
 
 from mpfjax.checks import checked
 from mpfjax.exact.kalman import (
+    Law,
     LinearStep,
     Moments,
     checked_rows,
-    filtered_moments,
-    smoothed_moments,
+    filtered,
+    smoothed,
 )
 from mpfjax.models.linear import SwitchingLinearGaussianModel
 from mpfjax.models.observations import Series
@@ -72,14 +73,14 @@ def _enumerated(
     for s in range(length):
         log_prior = log_prior + model.log_transition(sequences[:, s + 1], sequences[:, s])
     of_each = jax.vmap(lambda sequence: _kalman_smoother(model, sequence, observations))
-    filtered, smoothed, log_densities = of_each(sequences)
+    of_filter, of_smoother, log_densities = of_each(sequences)
     log_weights = log_prior[:, None] + jnp.cumsum(log_densities, axis=1)
     log_evidence = jax.vmap(log_sum_exp)(log_weights.T)
     weights = jnp.exp(log_weights - log_evidence[None])
     is_regime = jax.nn.one_hot(sequences, k, dtype=weights.dtype)
-    means, covariances = _mixed(weights, *filtered)
+    means, covariances = _mixed(weights, *of_filter)
     final = jnp.broadcast_to(weights[:, -1:], (len(places), length + 1))
-    smoothed_means, smoothed_covariances = _mixed(final, *smoothed)
+    smoothed_means, smoothed_covariances = _mixed(final, *of_smoother)
     increments = jnp.diff(log_evidence, prepend=jnp.zeros(1, log_evidence.dtype))
     return SwitchingFilterRun(
         regime_probabilities=jnp.einsum("st,stk->tk", weights, is_regime[:, 1:]),
@@ -118,7 +119,7 @@ def _kalman_smoother(
         return LinearStep(*dynamics, of(z, model.H, p, d), of(z, model.c, p), of(z, model.R, p, p))
 
     d, p = model.m0.shape[-1], observations.shape[1]
-    start = of(sequence[0], model.m0, d), of(sequence[0], model.P0, d, d)
-    filtered, increments = filtered_moments(start, step_of, sequence[1:], observations)
-    smoothed, _ = smoothed_moments(start, filtered, step_of, sequence[1:])
-    return filtered, smoothed, increments
+    start = Law.of(of(sequence[0], model.m0, d), of(sequence[0], model.P0, d, d))
+    laws, increments = filtered(start, step_of, sequence[1:], observations)
+    moments, _ = smoothed(start, laws, step_of, sequence[1:])
+    return laws.moments, moments, increments
