@@ -100,6 +100,15 @@ def test_kalman_filter_and_smoother_condition_the_joint_gaussian(parts, observat
     np.testing.assert_allclose(run.lagged_covariances, lagged, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("reference", [kalman_filter, kalman_smoother])
+def test_a_missing_number_is_no_error_to_jax_debug_nans(reference):
+    model = mpfjax.LinearGaussianModel(**MODEL)
+    plain = reference(model, GAPS, missing="skip")
+    with jax.debug_nans(True):
+        debugged = reference(model, GAPS, missing="skip")
+    assert debugged.log_marginal_likelihood == plain.log_marginal_likelihood
+
+
 def test_kalman_smoother_of_several_series_at_once_and_its_derivative():
     model, gaps = mpfjax.LinearGaussianModel(**MODEL), jnp.asarray(GAPS)
 

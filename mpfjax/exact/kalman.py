@@ -6,6 +6,8 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import as_numbers, checked
@@ -100,20 +102,22 @@ def kalman_smoother(
     return _smooth(model, *_checked(model, observations, inputs, missing))
 
 
-def _checked(model: Any, data: PyTree, inputs: PyTree, missing: str) -> tuple[Array, PyTree]:
+def _checked(model: Any, data: PyTree, inputs: PyTree, missing: str) -> tuple[Any, PyTree]:
     series = gathered(data, inputs, missing)
     rows = checked_rows(series, model.H.shape[0], model.m0.dtype)
     return rows, steps_of_inputs(series.inputs, rows.shape[0], model)
 
 
-def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Float[Array, "t p"]:
+def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Any:
     """y_1..y_t as an array of this type, NaN where missing; a `ValueError` for what is none."""
     rows = as_numbers("observations", series.observations, floating=True)
     if rows.ndim != 2 or rows.shape[1] != num_rows:
         raise ValueError(f"observations: shape {rows.shape} is not (t, {num_rows})")
     present = present_steps(rows, series, takes_nan=series.skips_missing)
-    rows = jnp.asarray(rows).astype(dtype)
-    return rows if present is None else jnp.where(present[:, None], rows, jnp.nan)
+    # In numpy as far as it is known: to JAX with `jax_debug_nans` an array with a NaN is an error.
+    numpy: Any = jnp if any(isinstance(each, Tracer) for each in (rows, present)) else np
+    rows = numpy.asarray(rows, dtype)
+    return rows if present is None else numpy.where(present[:, None], rows, numpy.nan)
 
 
 @eqx.filter_jit
