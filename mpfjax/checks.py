@@ -324,6 +324,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
                     rule.check(values[name], name)
             return function(*args, **kwargs)
         except Exception as error:
+            if line := _users_line(error):
+                _begin(error, *line)
             error.__traceback__ = _outside(error.__traceback__)
             raise
 
@@ -470,15 +472,28 @@ def saying(who: str, given: str = "") -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        said = "".join(f"{part}, " for part in (who, _place(error.__traceback__), given) if part)
-        said = f"{said[:-2]}: " + _UNKNOWN_NUMBERS * isinstance(error, _OF_TRACERS)
-        if len(error.args) == 1 and isinstance(error.args[0], str):
-            error.args = (said + error.args[0],)
-        else:  # it makes its text of other things
-            error.add_note(said)
+        _begin(error, who, *_users_line(error)[1:], given)
         raise
 
 
+def _begin(error: Exception, *parts: str) -> None:
+    """Put what is known of where it comes from before the text of an error, the first time."""
+    if _BEGUN in vars(error):
+        return
+    setattr(error, _BEGUN, True)
+    said = ", ".join(filter(None, parts)) + ": "
+    if len(error.args) != 1 or not isinstance(error.args[0], str):
+        error.add_note(said)  # it makes its text of other things
+    elif isinstance(error, _OF_TRACERS):
+        first, *others = error.args[0].splitlines()
+        # Between them JAX prints what the number comes from, a page of its own operations.
+        link = [line for line in others if "https://" in line]
+        error.args = ("\n".join([said + _UNKNOWN_NUMBERS, first, *link]),)
+    else:
+        error.args = (said + error.args[0],)
+
+
+_BEGUN = "_says_where"
 _OF_TRACERS = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
@@ -486,24 +501,30 @@ _OF_TRACERS = (
 )
 _UNKNOWN_NUMBERS = (
     "Python or numpy asks here for numbers that JAX knows only as the program runs; write jnp.where"
-    " in place of `if`, and jax.numpy in place of numpy\n"
+    " in place of `if`, and jax.numpy in place of numpy"
 )
 
 
-def _place(raised: types.TracebackType | None) -> str:
-    """The line of the user's own code that raised, and its text; nothing where it is not theirs."""
-    lines = [at for at in traceback.walk_tb(raised) if not _module_of(at[0]).startswith(_INNER)]
-    # What it calls may be of JAX, or of another library.
-    root = _module_of(lines[0][0]).partition(".")[0] if lines else ""
-    if not lines or root in _JAX:
-        return ""
-    frame, line = [at for at in lines if _module_of(at[0]).partition(".")[0] == root][-1]
+def _users_line(error: Exception) -> tuple[str, ...]:
+    """The user's own function in which it was raised, and the line; nothing where in none."""
+    frames = [at for at in traceback.walk_tb(error.__traceback__) if _root_of(at[0]) not in _JAX]
+    # What it calls may be of another library, but not of this one.
+    if not frames or _module_of(frames[-1][0]).startswith(_INNER):
+        return ()
+    users = [at for at in frames if not _module_of(at[0]).startswith(_INNER)]
+    function = users[0][0]
+    frame, line = [at for at in users if _root_of(at[0]) == _root_of(function)][-1]
     path = frame.f_code.co_filename
-    return f"line {line} of {Path(path).name}, `{linecache.getline(path, line).strip()}`"
+    text = linecache.getline(path, line).strip()
+    return function.f_code.co_qualname, f"line {line} of {Path(path).name}, `{text}`"
 
 
 def _module_of(frame: types.FrameType) -> str:
     return frame.f_globals.get("__name__", "")
+
+
+def _root_of(frame: types.FrameType) -> str:
+    return _module_of(frame).partition(".")[0]
 
 
 def _outside(found: types.TracebackType | None) -> types.TracebackType | None:
