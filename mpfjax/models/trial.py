@@ -2,15 +2,17 @@
 series drawn from a model.
 """
 
-from collections.abc import Callable, Iterator
+import contextlib
+from collections.abc import Iterator
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, checked
+from mpfjax.checks import Count, checked, warn
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_log_density,
@@ -29,8 +31,8 @@ from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 _KEYS, _PLACES, _DRAWS = 64, 4, 32  # of the draws that must differ
 _FAMILIES, _SIBLINGS = 8, 128  # of those that log_transition must know
-# Of a right model, variances and errors are beyond these once in a million keys.
-_MOST_RATIO, _MOST_ERRORS = 4.0, 5.0
+# Of a right model, variances are beyond this, and sums as improbable, once in a million keys.
+_MOST_RATIO, _LEAST_CHANCE = 4.0, 1e-6
 
 
 @checked
@@ -55,7 +57,10 @@ def check_model(
       Given x_1 and some possible x_0, the one that it came from must be as likely as it says.
 
     The last two look at a few thousand random draws, of x_0 and of the first two steps: they accept
-    a right model, and may accept one that is wrong by a few percent. `inputs` are u_1.
+    a right model, and may accept one that is wrong by a few percent, or in what seldom happens.
+    `inputs` are u_1. A `UserWarning` says where a density has a derivative of NaN by the model's
+    numbers, so that they cannot be tuned by gradient; with `handles_missing`, also where the first
+    number of y_1 is missing.
     """
     inputs, observation = one_input(inputs, model), one_observation(observation)
     if is_made_of_noise(model):
@@ -67,19 +72,21 @@ def check_model(
 def _faults(key: Key[Array, ""], model: Any, observation: PyTree, inputs: PyTree) -> Iterator[str]:
     """What is wrong with the model's methods, one after the other, by their names."""
     keys = jax.random.split(key, 5)
-    yield from _of_draws("sample_initial", keys[0], lambda key: _initial(key, model, _DRAWS))
+    yield from _of_draws("sample_initial", _many_initial(keys[0], model))
     if callable(getattr(model, "log_initial", None)):
         values = model.log_initial(model.sample_initial(key, _DRAWS))
         if not np.isfinite(check_log_density(values, model, "log_initial", _DRAWS)).all():
             yield "log_initial is NaN or infinite at draws of sample_initial"
-    starts = jax.jit(lambda: _initial(keys[1], model, _FAMILIES))()
+    starts = _places(keys[1], model)
     model = with_inputs(model, inputs)
     copies = jax.tree.map(lambda leaf: jnp.repeat(leaf, _DRAWS, axis=0), starts)
     same = jax.tree.map(lambda leaf: leaf[: _PLACES * _DRAWS], copies)
-    yield from _of_draws("sample_transition", keys[2], lambda key: moved(key, model, same))
-    yield from _of_likelihood(keys[3], model, observation, copies)
+    yield from _of_draws("sample_transition", _many_moved(keys[2], model, same))
+    states = _moved(keys[3], model, copies)
+    yield from _of_likelihood(model, observation, states)
     if is_mixed(model) or callable(getattr(model, "log_transition", None)):
-        yield from _of_transition(keys[4], model, starts)
+        logs, parents = _of_families(keys[4], model, starts)
+        yield from _of_transition(np.asarray(logs, float), _columns(parents))
 
 
 def _initial(key: Key[Array, ""], model: Any, number: int) -> PyTree:
@@ -88,14 +95,30 @@ def _initial(key: Key[Array, ""], model: Any, number: int) -> PyTree:
     return with_moments(model, drawn)
 
 
-def _of_draws(
-    method: str, key: Key[Array, ""], draw: Callable[[Key[Array, ""]], PyTree]
-) -> Iterator[str]:
+@eqx.filter_jit
+def _places(key, model):
+    return _initial(key, model, _FAMILIES)
+
+
+@eqx.filter_jit
+def _many_initial(key, model):
+    return jax.vmap(lambda key: _initial(key, model, _DRAWS))(jax.random.split(key, _KEYS))
+
+
+@eqx.filter_jit
+def _many_moved(key, model, states):
+    return jax.vmap(lambda key: moved(key, model, states))(jax.random.split(key, _KEYS))
+
+
+_moved, _likelihoods = eqx.filter_jit(moved), eqx.filter_jit(likelihoods)
+
+
+def _of_draws(method: str, draws: PyTree) -> Iterator[str]:
     """Faults of draws for many keys, of particles of a few places side by side.
 
     Their mean must not vary more than that of independent ones.
     """
-    for column in _columns(jax.jit(jax.vmap(draw))(jax.random.split(key, _KEYS))):
+    for column in _columns(draws):
         by_place = column.reshape(_KEYS, -1, _DRAWS)
         if np.isnan(column).any():
             yield f"{method} draws NaN"
@@ -120,28 +143,70 @@ def _columns(draws: PyTree) -> list[np.ndarray]:
     return [row[:, :, k] for row in rows for k in range(row.shape[2])]
 
 
-def _of_likelihood(
-    key: Key[Array, ""], model: Any, observation: PyTree, starts: PyTree
-) -> Iterator[str]:
+def _of_likelihood(model: Any, observation: PyTree, states: PyTree) -> Iterator[str]:
     """Faults of log L of draws of x_1."""
-    states = jax.jit(lambda: moved(key, model, starts))()
-    density = jax.jit(lambda states: likelihoods(model, observation, states))
-    values, half = np.asarray(density(states), float), _FAMILIES * _DRAWS // 2
-    others = np.asarray(density(jax.tree.map(lambda leaf: leaf[half:], states)), float)
+    values, half = (
+        np.asarray(_likelihoods(model, observation, states), float),
+        _FAMILIES * _DRAWS // 2,
+    )
+    others = jax.tree.map(lambda leaf: leaf[half:], states)
+    others = np.asarray(_likelihoods(model, observation, others), float)
     if not (values < np.inf).all():
         yield "log_likelihood is NaN or +inf at a draw of x_1"
     if not np.allclose(values[half:], others, rtol=1e-3, atol=1e-3):
         yield "log_likelihood of a particle depends on the other particles"
     if (values == -np.inf).all():
         yield f"log_likelihood is -inf at all {len(values)} draws of x_1: no particle explains it"
+    _warn_of_derivative(model, observation, states)
+    if getattr(model, "handles_missing", False):
+        partly = _with_first_missing(observation)
+        if partly is not None:
+            if np.isnan(_likelihoods(model, partly, states)).any():
+                yield "log_likelihood is NaN where a number is missing, despite handles_missing"
+            hint = "; blank it before it is used: y = jnp.where(jnp.isnan(y), 0.0, y)"
+            _warn_of_derivative(model, partly, states, f" where a number is missing{hint}")
 
 
-def _of_transition(key: Key[Array, ""], model: Any, states: PyTree) -> Iterator[str]:
-    """Faults of log D of a draw given its own x_{t-1}, beside that given its siblings."""
+def _with_first_missing(observation: PyTree) -> PyTree:
+    """y without its first floating point number; None if it has no other."""
+    leaves, structure = jax.tree.flatten(observation)
+    sizes = [jnp.size(leaf) * jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves]
+    if sum(sizes) < 2:
+        return None
+    at = int(np.flatnonzero(sizes)[0])
+    first = jnp.ravel(leaves[at]).at[0].set(jnp.nan)
+    leaves[at] = first.reshape(jnp.shape(leaves[at]))
+    return jax.tree.unflatten(structure, leaves)
+
+
+def _warn_of_derivative(model: Any, observation: PyTree, states: PyTree, where: str = "") -> None:
+    """A warning if log L has a derivative of NaN by the numbers of the model."""
+    # A model that cannot be differentiated at all says so to whoever does it.
+    with contextlib.suppress(TypeError, ValueError, NotImplementedError):
+        run = lambda model: _derivative(model, observation, states)  # noqa: E731
+        slopes = jax.tree.leaves(with_floats_traced(run, model))
+        if any(np.isnan(slope).any() for slope in slopes):
+            said = f"{model_name(model)}.log_likelihood has a derivative of NaN{where}"
+            warn(f"model: {said}", UserWarning)
+
+
+@eqx.filter_jit
+def _derivative(model, observation, states):
+    def total(model: Any) -> Array:
+        values = likelihoods(model, observation, states)
+        return jnp.sum(jnp.where(jnp.isfinite(values), values, 0.0))
+
+    return eqx.filter_grad(total)(model)
+
+
+@eqx.filter_jit
+def _of_families(key, model, states):
+    """log D of each draw given each of the siblings of its own x_{t-1}, (families, s, s)."""
     key_parents, key_children = jax.random.split(key)
     rows, columns = np.divmod(np.arange(_SIBLINGS**2), _SIBLINGS)
 
-    def of_family(keys: Key[Array, "2"], state: PyTree) -> tuple[Float[Array, "s s"], PyTree]:
+    def of_family(family: tuple[Key[Array, "2"], PyTree]) -> tuple[Float[Array, "s s"], PyTree]:
+        keys, state = family
         one = jax.tree.map(lambda leaf: jnp.repeat(leaf[None], _SIBLINGS, axis=0), state)
         parents = moved(keys[0], model, one)
         children = moved(keys[1], model, parents)
@@ -150,26 +215,53 @@ def _of_transition(key: Key[Array, ""], model: Any, states: PyTree) -> Iterator[
         return log_transition(model, *pair).reshape(_SIBLINGS, _SIBLINGS), parents
 
     keys = [jax.random.split(key, _FAMILIES) for key in (key_parents, key_children)]
-    of_each = lambda pair: of_family(*pair)  # noqa: E731
-    found = jax.jit(lambda: jax.lax.map(of_each, (jnp.stack(keys, 1), states)))()
-    logs, parents = np.asarray(found[0], float), found[1]
+    return jax.lax.map(of_family, (jnp.stack(keys, 1), states))
+
+
+def _of_transition(
+    logs: Float[np.ndarray, "f s s"], parents: list[Float[np.ndarray, "f s"]]
+) -> Iterator[str]:
+    """Faults of log D of a draw given its own x_{t-1}, beside that given its siblings."""
     if np.isnan(logs).any() or not np.isfinite(np.diagonal(logs, axis1=1, axis2=2)).all():
         yield "log_transition is NaN, or infinite at a draw of sample_transition"
     shares = np.exp(logs - logs.max(axis=2, keepdims=True))
     shares /= shares.sum(axis=2, keepdims=True)
     values = [("log D", np.where(shares > 0, logs, 0.0))]
-    values += [("x_(t-1)", np.tile(x[:, None], (1, _SIBLINGS, 1))) for x in _columns(parents)]
+    values += [("x_(t-1)", np.tile(x[:, None], (1, _SIBLINGS, 1))) for x in parents]
     for what, of_siblings in values:
         # Where the shares are right, the expectation of the own value is theirs.
         own = np.diagonal(of_siblings, axis1=1, axis2=2)
-        excess = own - np.sum(shares * of_siblings, axis=2)
-        mean, error = excess.mean(), excess.std() / np.sqrt(excess.size)
-        if abs(mean) > _MOST_ERRORS * error + 1e-3 * own.std():
+        beside = of_siblings - np.sum(shares * of_siblings, axis=2, keepdims=True)
+        excess = np.diagonal(beside, axis1=1, axis2=2).sum()
+        deviation = np.sqrt(np.sum(shares * beside**2))
+        beyond = abs(excess) - 1e-3 * own.size * own.std()
+        if _log_chance(np.sign(excess) * beside, shares, beyond, deviation) < np.log(_LEAST_CHANCE):
+            mean, error = excess / own.size, deviation / own.size
             yield (
                 "log_transition is not the density of sample_transition: given the x_(t-1) that"
                 f" draws come from, {what} is {mean:.2g} ± {error:.2g} above what it says; does a"
                 " factor that depends on x_(t-1) lack?"
             )
+
+
+def _log_chance(
+    beside: Float[np.ndarray, "f s s"],
+    shares: Float[np.ndarray, "f s s"],
+    excess: float,
+    deviation: float,
+) -> float:
+    """log of the most that a sum of values drawn by the shares is at least as large, by Chernoff.
+
+    The bound holds for what seldom happens too, where a sum is far from normal.
+    """
+    if excess <= 4 * deviation:
+        return 0.0
+    if deviation == 0:
+        return -np.inf
+    slopes = np.geomspace(1e-4, 1e2, 41) / deviation
+    with np.errstate(over="ignore"):
+        bounds = [np.log(np.sum(shares * np.exp(k * beside), axis=2)).sum() for k in slopes]
+    return float(np.min(np.asarray(bounds) - slopes * excess))
 
 
 @checked

@@ -1,10 +1,14 @@
 """`check_model` accepts models that are right, and names what is wrong with others."""
 
+from collections.abc import Callable
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.scipy.stats import cauchy, norm
+from jax.scipy.special import logsumexp
+from jax.scipy.stats import cauchy, expon, norm, poisson, uniform
 
 import mpfjax
 from tests import switching
@@ -59,7 +63,119 @@ class Volatile(ScalarLinear):
         return norm.logpdf(states, 0.9 * previous_states, jnp.exp(0.5 * previous_states))
 
 
+class Step(mpfjax.AbstractStateSpaceModel):
+    """A step by any law: a draw, and its log density, of x given the x before."""
+
+    draw: Callable = eqx.field(static=True)
+    log_density: Callable = eqx.field(static=True)
+    start: Callable = eqx.field(static=True, default=jax.random.normal)
+
+    def sample_initial(self, key, num_particles):
+        return self.start(key, (num_particles,))
+
+    def sample_transition(self, key, states):
+        return self.draw(key, states)
+
+    def log_transition(self, states, previous_states):
+        return self.log_density(states, previous_states)
+
+    def log_likelihood(self, observation, states):
+        return norm.logpdf(observation, states, 2.0)
+
+
+class BirthsAndDeaths(mpfjax.AbstractStateSpaceModel):
+    """An object that walks, dies in one step of 200 and is born in one of 50, anywhere."""
+
+    death: float = 0.005
+    birth: float = 0.02
+
+    def sample_initial(self, key, num_particles):
+        place = 10 * jax.random.normal(key, (num_particles,))
+        return {"alive": jnp.ones(num_particles, bool), "place": place}
+
+    def sample_transition(self, key, states):
+        keys, (alive, place) = jax.random.split(key, 3), states.values()
+        changes = jax.random.uniform(keys[0], place.shape) < jnp.where(
+            alive, self.death, self.birth
+        )
+        walked = place + 0.1 * jax.random.normal(keys[1], place.shape)
+        born = 10 * jax.random.normal(keys[2], place.shape)
+        now = alive != changes
+        return {"alive": now, "place": jnp.where(now, jnp.where(alive, walked, born), 0.0)}
+
+    def log_transition(self, states, previous_states):
+        (now, place), (alive, before) = states.values(), previous_states.values()
+        chance = jnp.where(alive, self.death, self.birth)
+        mean, deviation = jnp.where(alive, before, 0.0), jnp.where(alive, 0.1, 10.0)
+        log_place = jnp.where(now, norm.logpdf(place, mean, deviation), 0.0)
+        return jnp.log(jnp.where(now == alive, 1 - chance, chance)) + log_place
+
+    def log_likelihood(self, observation, states):
+        return jnp.where(states["alive"], norm.logpdf(observation, states["place"], 10.0), -5.0)
+
+
+def jumped(chance, size):
+    """A walk with seldom jumps."""
+
+    def draw(key, x):
+        keys = jax.random.split(key, 2)
+        scale = jnp.where(jax.random.bernoulli(keys[0], chance, x.shape), size, 0.1)
+        return x + scale * jax.random.normal(keys[1], x.shape)
+
+    def log_density(x, old):
+        of_each = [norm.logpdf(x, old, scale) for scale in (size, 0.1)]
+        return logsumexp(jnp.stack(of_each), 0, b=jnp.array([[chance], [1 - chance]]))
+
+    return Step(draw, log_density)
+
+
+def chain(*rows):
+    """A Markov chain of whole numbers."""
+    logs = jnp.log(jnp.asarray(rows))
+
+    def start(key, shape):
+        return jax.random.randint(key, shape, 0, len(rows)).astype(jnp.int32)
+
+    def draw(key, z):
+        return jax.random.categorical(key, logs[z]).astype(jnp.int32)
+
+    return Step(draw, lambda z, old: logs[old, z], start)
+
+
+STEPS = {
+    "seldom jumps": jumped(0.01, 5.0),
+    "hardly any jumps": jumped(0.0005, 50.0),
+    "a sticky chain": chain([0.999, 0.001], [0.01, 0.99]),
+    "a chain of three": chain([0.5, 0.3, 0.2], [0.0, 0.9, 0.1], [1 / 3, 1 / 3, 1 / 3]),
+    "heavy tails": Step(
+        lambda key, x: 0.5 * x + jax.random.cauchy(key, x.shape),
+        lambda x, old: cauchy.logpdf(x, 0.5 * old),
+    ),
+    "uniform": Step(
+        lambda key, x: x + jax.random.uniform(key, x.shape),
+        lambda x, old: uniform.logpdf(x, old),
+    ),
+    "upward": Step(
+        lambda key, x: x + jax.random.exponential(key, x.shape),
+        lambda x, old: expon.logpdf(x, old),
+    ),
+    "counts": Step(
+        lambda key, x: jax.random.poisson(key, 1 + 0.5 * x).astype(jnp.int32),
+        lambda x, old: poisson.logpmf(x, 1 + 0.5 * old),
+        lambda key, shape: jax.random.poisson(key, 2.0, shape).astype(jnp.int32),
+    ),
+    "forgetful": Step(
+        lambda key, x: jax.random.normal(key, x.shape), lambda x, old: norm.logpdf(x) + 0 * old
+    ),
+    "far": Step(
+        lambda key, x: x + 0.1 * jax.random.normal(key, x.shape),
+        lambda x, old: norm.logpdf(x, old, 0.1),
+        lambda key, shape: 300.0 + jax.random.normal(key, shape),
+    ),
+}
 RIGHT = {
+    "births and deaths": (BirthsAndDeaths(), NUMBER),
+    **{name: (step, NUMBER) for name, step in STEPS.items()},
     "batched": (Drift(), NUMBER),
     "x_0 known": (Known(), NUMBER),
     "regimes": (Regimes(), NUMBER),
@@ -72,9 +188,12 @@ RIGHT = {
 }
 
 
-@pytest.mark.parametrize("name", quick_of(RIGHT, ["x_0 known", "regimes", "volatile", "quadratic"]))
-def test_what_is_right_is_accepted(name):
-    mpfjax.check_model(jax.random.key(0), *RIGHT[name])
+@pytest.mark.parametrize("name", quick_of(RIGHT, ["x_0 known", "births and deaths", "volatile"]))
+@pytest.mark.parametrize("num_keys", [8, pytest.param(1000, marks=pytest.mark.weekly)])
+def test_what_is_right_is_accepted(name, num_keys, recwarn):
+    for seed in range(num_keys):
+        mpfjax.check_model(jax.random.key(seed), *RIGHT[name])
+    assert not recwarn.list
 
 
 def normal(x, mean, scale):
@@ -141,6 +260,41 @@ def test_what_is_wrong_is_named(name):
     base, methods, named = WRONG[name]
     with pytest.raises(ValueError, match=f"model: Changed.*{named}"):
         mpfjax.check_model(jax.random.key(0), type("Changed", (base,), methods)(), NUMBER)
+
+
+class Sensors(Drift):
+    """Two readings with one gain, either of which may be missing."""
+
+    gain: jax.Array = eqx.field(default_factory=lambda: jnp.asarray(2.0))
+    handles_missing = True
+
+    def log_likelihood(self, observation, states):
+        is_there = ~jnp.isnan(observation)
+        errors = jnp.where(is_there, observation, 0.0)[None] - self.gain * states
+        return -0.5 * jnp.sum(jnp.where(is_there[None], errors, 0.0) ** 2, axis=1)
+
+
+class Careless(Sensors):
+    def log_likelihood(self, observation, states):
+        errors = jnp.where(
+            jnp.isnan(observation)[None], 0.0, self.gain * (observation[None] - states)
+        )
+        return -0.5 * jnp.sum(errors**2, axis=1)
+
+
+class Forgotten(Sensors):
+    def log_likelihood(self, observation, states):
+        return -0.5 * jnp.sum((observation[None] - self.gain * states) ** 2, axis=1)
+
+
+def test_a_missing_number_must_leave_the_likelihood_and_its_derivative_finite(recwarn):
+    key, seen = jax.random.key(0), jnp.array([0.3, 0.1])
+    mpfjax.check_model(key, Sensors(), seen)
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"Careless.*derivative of NaN where a number is missing"):
+        mpfjax.check_model(key, Careless(), seen)
+    with pytest.raises(ValueError, match=r"Forgotten.*NaN where a number is missing"):
+        mpfjax.check_model(key, Forgotten(), seen)
 
 
 class Near(Drift):
