@@ -53,6 +53,52 @@ def test_what_would_change_is_refused(value):
         as_numbers("x", value)
 
 
+SECONDS = 1.7e9 + np.arange(400.0)
+LOST = {
+    "Unix times": SECONDS,
+    "Unix times in whole numbers": SECONDS.astype(int),
+    "of JAX": jnp.asarray(SECONDS, jnp.float32),
+    "milliseconds": (1000 * SECONDS).astype(int),
+    "nanoseconds": 1e9 * SECONDS,
+    "three times": SECONDS[:3, None],
+    "Julian dates": 2460000.5 + np.arange(40) / 24,
+    "modified Julian dates": 60000.0 + np.arange(40) / 1440,
+    "UTM metres": np.stack([np.arange(40.0), 5.6e6 + np.random.default_rng(0).normal(size=40)], 1),
+    "indices": 2**24 + np.arange(5.0),
+}
+
+
+@pytest.mark.parametrize("name", LOST)
+def test_differences_that_float32_loses_are_refused_where_arrays_enter(name):
+    numbers, one = LOST[name], [[1.0]]
+    walk = mpfjax.LinearGaussianModel(one, one, one, one, [0.0], one, B=one)
+    key, filter, zeros = jax.random.key(0), mpfjax.particle_filter(walk, 4), np.zeros(len(numbers))
+    match = r"^{}: float32 cannot tell numbers near .*subtract in numpy before.*jax_enable_x64"
+    for call in (
+        lambda: mpfjax.run_filter(key, filter, numbers),
+        lambda: kalman_filter(walk, numbers),
+        lambda: mpfjax.monte_carlo(jax.random.split(key, 2), filter, mpfjax.Series(numbers)),
+    ):
+        with pytest.raises(ValueError, match=match.format("observations")):
+            call()
+    with pytest.raises(ValueError, match=match.format("inputs")):
+        mpfjax.run_filter(key, filter, zeros, inputs=numbers)
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        np.diff(SECONDS + 1e-3), np.full(9, 0.1), np.full(9, 1.7e9), 300 + OTHERS[0],
+        1e4 + np.random.default_rng(0).normal(size=99), np.arange(1000), 1e8 * np.arange(9.0),
+        2**20 + np.arange(9), np.array([1.0, 1.0 + 1e-9]), np.array([1.7e9]),
+        np.random.default_rng(0).integers(0, 2**31, 9), 
+        5 + np.random.default_rng(0).normal(size=10**5), np.array([np.nan, np.inf, 1.7e9, 1.7e9]),
+    ],
+)  # fmt: skip
+def test_what_float32_holds_well_enough_is_taken(numbers):
+    as_numbers("x", numbers, in_time=True)
+
+
 # By name: a function and numbers, whose differences are of either sign.
 TAKEN = {
     "crps": (lambda x: metrics.crps(x[1:], jnp.ones(2), x[0]), [5, 2, 4]),

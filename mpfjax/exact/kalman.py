@@ -110,7 +110,7 @@ def _checked(model: Any, data: PyTree, inputs: PyTree, missing: str) -> tuple[An
 
 def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Any:
     """y_1..y_t as an array of this type, NaN where missing; a `ValueError` for what is none."""
-    rows = as_numbers("observations", series.observations, floating=True)
+    rows = as_numbers("observations", series.observations, floating=True, in_time=True)
     if rows.ndim != 2 or rows.shape[1] != num_rows:
         raise ValueError(f"observations: shape {rows.shape} is not (t, {num_rows})")
     present = present_steps(rows, series, takes_nan=series.skips_missing)

@@ -79,7 +79,7 @@ def steps_of_inputs(
     inputs: PyTree, length: int, model: Any, of_what: str = "observations"
 ) -> PyTree:
     """u_1, ..., u_t as arrays; a `ValueError` unless they are finite numbers, one for each step."""
-    arrays = one_input(inputs, model)
+    arrays = one_input(inputs, model, in_time=True)
     if arrays is None:
         return None
     own_length = _length(arrays, inputs, "inputs")
@@ -88,26 +88,26 @@ def steps_of_inputs(
     return _refused_where(~_usable_steps(arrays, False), arrays, "inputs: NaN or infinite")
 
 
-def one_input(inputs: PyTree, model: Any) -> PyTree:
+def one_input(inputs: PyTree, model: Any, in_time: bool = False) -> PyTree:
     """The arrays of u_t; a `ValueError` for anything but numbers, or a model without inputs."""
     if inputs is None:
         return None
     if not takes_inputs(model):
         place = "a field `inputs: PyTree = None`, nor with_inputs, where u_t would go"
         raise ValueError(f"inputs: {model_name(model)} has neither {place}")
-    return as_arrays(inputs, "inputs")
+    return as_arrays(inputs, "inputs", in_time)
 
 
-def as_arrays(observations: PyTree, name: str = "observations") -> PyTree:
+def as_arrays(observations: PyTree, name: str = "observations", in_time: bool = True) -> PyTree:
     """The observations as arrays of numbers that JAX takes as they are; a `ValueError` for none."""
     if not jax.tree.leaves(observations):
         raise ValueError(f"{name}: there is none")
-    return jax.tree.map(lambda leaf: as_numbers(name, leaf), observations)
+    return jax.tree.map(lambda leaf: as_numbers(name, leaf, in_time=in_time), observations)
 
 
 def one_observation(observation: PyTree) -> PyTree:
     """The arrays of y_t; a `ValueError` for none, anything but numbers, and too large ones."""
-    return as_arrays(observation, "observation")
+    return as_arrays(observation, "observation", in_time=False)
 
 
 class Fault(eqx.Module):
