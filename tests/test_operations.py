@@ -122,7 +122,8 @@ def test_the_last_position_before_each_point():
     places = np.sort(np.round(rng.random(300) ** 2 * 64 * 2**12) / 2**12)
     points = np.append(rng.random(500) * 64, places).astype(np.float32)
     positions, sought = (
-        prefix_sums.as_positions(jnp.asarray(values, jnp.float32)) for values in (places, points)
+        prefix_sums.Positions(indices(np.floor(values)), jnp.asarray(values % 1, jnp.float32))
+        for values in (places, points)
     )
     found = eqx.filter_jit(prefix_sums.last_before)(positions, sought, 64)
     np.testing.assert_array_equal(found, np.searchsorted(places, points, "right") - 1)

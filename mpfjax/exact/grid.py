@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import real_array, shown
-from mpfjax.models.base import check_log_density, require, with_inputs
+from mpfjax.models.base import real_each, require, with_inputs
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.observations import Series, as_series
 from mpfjax.models.steps import likelihoods
@@ -111,7 +111,7 @@ def _grid_filter(model, series, grid, width, log_initial, state_shape):
         def row(previous: Float[Array, "..."]) -> Float[Array, " g"]:
             copies = jnp.broadcast_to(previous, (num_points, *state_shape))
             values = model.log_transition(states, copies)
-            return check_log_density(values, model, "log_transition", num_points)
+            return real_each(values, num_points, model, "log_transition")
 
         return cell * jnp.exp(jax.vmap(row)(states))
 

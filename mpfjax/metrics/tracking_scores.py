@@ -97,21 +97,21 @@ def remove_ignored(
         return tracks
     regions = ignored[:, 1] == IGNORED_REGION
     labelled = np.concatenate([np.insert(truth[:, [0, *range(2, 6)]], 1, 0, 1), ignored[~regions]])
-    kept = np.ones(len(tracks), bool)
+    is_scored = np.ones(len(tracks), bool)
     for frame in np.unique(tracks[:, 0]):
         here = np.flatnonzero(tracks[:, 0] == frame)
         objects = labelled[labelled[:, 0] == frame]
         fields = ignored[regions & (ignored[:, 0] == frame), 2:]
         matched, owners = matches(tracks[here, 2:], objects[:, 2:])
-        kept[here[matched[objects[owners, 1] == IGNORED_OBJECT]]] = False
+        is_scored[here[matched[objects[owners, 1] == IGNORED_OBJECT]]] = False
         left = np.delete(here, matched)
         boxes = tracks[left, 2:]
         shared, areas, _ = _areas(boxes, fields)
         shares = np.where(areas > 0, shared / np.where(areas > 0, areas, 1.0), 0.0)
         inside = np.any(shares > 0.5 + _ROUNDING, axis=1)
         low = (min_height > 0) & (boxes[:, 3] <= min_height + _ROUNDING)
-        kept[left[inside | low]] = False
-    return tracks[kept]
+        is_scored[left[inside | low]] = False
+    return tracks[is_scored]
 
 
 def matches(boxes: np.ndarray, objects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,8 +131,8 @@ def overlap(
     boxes: Float[np.ndarray, "r 4"], objects: Float[np.ndarray, "s 4"]
 ) -> Float[np.ndarray, "r s"]:
     """Intersection over union of boxes (x, y, w, h); 0 where either has no area."""
-    shared, own, others = _areas(boxes, objects)
-    union = own + others - shared
+    shared, areas, others = _areas(boxes, objects)
+    union = areas + others - shared
     return np.where(shared > 0, shared / np.where(shared > 0, union, 1.0), 0.0)
 
 
@@ -142,8 +142,8 @@ def _areas(boxes: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarra
     near = np.maximum(boxes[..., :2], others[..., :2])
     far = np.minimum(boxes[..., :2] + boxes[..., 2:], others[..., :2] + others[..., 2:])
     sides = far - near, boxes[..., 2:], others[..., 2:]
-    shared, own, of_others = (np.prod(np.maximum(side, 0.0), axis=-1) for side in sides)
-    return shared, own, of_others
+    shared, areas, of_others = (np.prod(np.maximum(side, 0.0), axis=-1) for side in sides)
+    return shared, areas, of_others
 
 
 def _rows(rows: np.ndarray, argument: str) -> np.ndarray:

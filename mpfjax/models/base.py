@@ -85,8 +85,8 @@ class AbstractStateSpaceModel(eqx.Module):
 def takes_inputs(model: Any) -> bool:
     """Whether a model takes u_t: it has a field `inputs`, or its own `with_inputs`."""
     model = _innermost(model)
-    own = getattr(type(model), "with_inputs", AbstractStateSpaceModel.with_inputs)
-    return hasattr(model, "inputs") or own is not AbstractStateSpaceModel.with_inputs
+    method = getattr(type(model), "with_inputs", AbstractStateSpaceModel.with_inputs)
+    return hasattr(model, "inputs") or method is not AbstractStateSpaceModel.with_inputs
 
 
 def with_inputs(model: Any, inputs: PyTree) -> Any:
@@ -110,10 +110,10 @@ def is_made_of_noise(model: Any, state: str = "transition") -> bool:
     """Whether the model makes x_t of noise, or x_0 ("initial"), and has no other law for it."""
     drawing, making = f"sample_{state}", f"{state}_from_noise"
     size = "noise_dimension" if state == "transition" else "initial_noise_dimension"
-    own = type(_own(model))
+    kind = type(_own(model))
     # A class that draws a state itself may inherit how it is made of noise.
-    owners = [owner for owner in own.__mro__ if {drawing, making} & vars(owner).keys()]
-    is_other = callable(getattr(own, making, None)) and making not in vars(owners[0])
+    owners = [owner for owner in kind.__mro__ if {drawing, making} & vars(owner).keys()]
+    is_other = callable(getattr(kind, making, None)) and making not in vars(owners[0])
     return hasattr(model, making) and hasattr(model, size) and not is_other
 
 
@@ -202,22 +202,18 @@ def check_moved(
     states: Any, previous_states: Any, model: Any, method: str = "sample_transition"
 ) -> None:
     """Raise a `ValueError` where structure, shapes or types of x_t are not those of x_{t-1}."""
-    found, given = kinds(states), kinds(previous_states)
-    if found != given:
+    moved, expected = kinds(states), kinds(previous_states)
+    if moved != expected:
         who = f"model: {model_name(model)}.{method}"
-        raise ValueError(f"{who} returned {found}, and not the kind of x_(t-1), {given}")
+        raise ValueError(f"{who} returned {moved}, and not the kind of x_(t-1), {expected}")
 
 
-def check_log_density(
-    values: Any, model: Any, method: str, num_particles: int
-) -> Float[Array, " n"]:
-    """The result of a density of the model; a `ValueError` unless it is one real number each."""
-    return real_each(values, f"model: {model_name(model)}.{method}", num_particles)
-
-
-def real_each(values: Any, who: str, num_particles: int) -> Float[Array, " n"]:
-    """What the user's function returned; a `ValueError` unless it is one real number a particle."""
+def real_each(values: Any, num_particles: int, asked: Any, method: str = "") -> Float[Array, " n"]:
+    """What a method of a model returned, or a function that `asked` names; a `ValueError` unless
+    it is one real number a particle.
+    """
     if getattr(values, "shape", None) != (num_particles,) or jnp.iscomplexobj(values):
+        who = f"model: {model_name(asked)}.{method}" if method else asked
         real = f"one real value a particle, ({num_particles},)"
         raise ValueError(f"{who} returned {shown(values)}, not {real}")
     return jnp.asarray(values)

@@ -91,8 +91,10 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """log L of the measurements, over that of clutter alone."""
         there = _measured(observation)
-        # A number that no logarithm turns into one that is not finite, nor its gradient.
-        fill = lambda leaf: jnp.where(jnp.isnan(leaf), jnp.ones_like(leaf), leaf)  # noqa: E731
+
+        def fill(leaf: Array) -> Array:
+            # A number that no logarithm turns into one that is not finite, nor its gradient.
+            return jnp.where(jnp.isnan(leaf), jnp.ones_like(leaf), leaf)
 
         def log_odds(measurement: PyTree) -> Float[Array, " n"]:
             density = self.clutter_density

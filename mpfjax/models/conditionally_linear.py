@@ -186,11 +186,11 @@ def updated(
     model: Any, observation: PyTree, state: MarginalisedState
 ) -> tuple[MarginalisedState, Float[Array, " n"] | None]:
     """The moments of x_t given y_t too, and log p(y_t | z, y_1..y_{t-1}); None if unobserved."""
-    seen = emission_of(model, state.latent, state)
-    if seen is None:
+    emission = emission_of(model, state.latent, state)
+    if emission is None:
         return state, None
-    n, rows = state.mean.shape[0], observation_rows(model, observation, seen, state.mean.dtype)
-    law, log_density = gaussians.update(filtered_gaussian(model, state), rows, seen)
+    n, rows = state.mean.shape[0], observation_rows(model, observation, emission, state.mean.dtype)
+    law, log_density = gaussians.update(filtered_gaussian(model, state), rows, emission)
     mean, covariance = particles_first(law.mean, n), particles_first(law.covariance, n)
     return MarginalisedState(state.latent, mean, covariance), jnp.broadcast_to(log_density, (n,))
 
@@ -283,8 +283,8 @@ def observation_rows(
     model: Any, observation: PyTree, seen: Linear, dtype: jnp.dtype
 ) -> Float[Array, "p 1"]:
     """y_t as a column, checked."""
-    found = as_numbers("observation", model.linear_observation(observation))
-    rows, p = jnp.atleast_1d(found).astype(dtype), seen.matrix.shape[0]
+    numbers = as_numbers("observation", model.linear_observation(observation))
+    rows, p = jnp.atleast_1d(numbers).astype(dtype), seen.matrix.shape[0]
     check_shape(f"{p}", observation=rows)
     return jnp.reshape(rows, (p, 1))
 
@@ -298,6 +298,6 @@ def _checked(model: Any, method: str, parts: Any, n: int, **shapes: str) -> list
             fits &= isinstance(part, kind)
     if not fits:
         who = f"model: {model_name(model)}.{method}"
-        found = shown(jax.tree.map(jnp.shape, parts))
-        raise ValueError(f"{who} returned {found}, not {shapes}, or {n} of them")
+        given = shown(jax.tree.map(jnp.shape, parts))
+        raise ValueError(f"{who} returned {given}, not {shapes}, or {n} of them")
     return [jnp.asarray(part) for part in parts]

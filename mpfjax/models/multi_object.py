@@ -1,6 +1,7 @@
 """The joint state of several objects: independent dynamics and likelihoods, and interaction."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -13,9 +14,9 @@ from mpfjax.checks import POSITIVE, Count, Fitting, check_one_each, checked, to_
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
-    check_log_density,
     check_moved,
     is_made_of_noise,
+    real_each,
     replaced,
     with_inputs,
 )
@@ -126,7 +127,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """Σ_j log L(y_t | x_t^j) + Σ_{i<j} log ψ(x_t^i, x_t^j)."""
         observation = self.prepare_observation(observation)
-        weigh = lambda states, j: self.object_log_likelihood(observation, states, j)  # noqa: E731
+        weigh = partial(self.object_log_likelihood, observation)
         total = jnp.sum(jax.vmap(weigh, in_axes=(1, 0))(states, self._indices), axis=0)
         if self.interaction is None or self.num_objects == 1:
             return total
@@ -158,7 +159,10 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
         `axes` are those of the objects.
         """
-        of_one = lambda j, *own: getattr(self.object_at(j), method)(*own)  # noqa: E731
+
+        def of_one(j: Int[Array, ""], *parts: PyTree) -> PyTree:
+            return getattr(self.object_at(j), method)(*parts)
+
         return jax.vmap(of_one, in_axes=(0, *axes), out_axes=1)(self._indices, *arguments)
 
     @property
@@ -194,8 +198,9 @@ class MultiObjectModel(AbstractStateSpaceModel):
                 particles,
             )
         rows = jnp.arange(objects.shape[0], dtype=jnp.int32)
-        pick = lambda leaf: leaf.at[rows, objects].get(mode="promise_in_bounds")  # noqa: E731
-        return jax.tree.map(pick, particles)
+        return jax.tree.map(
+            lambda leaf: leaf.at[rows, objects].get(mode="promise_in_bounds"), particles
+        )
 
     def replace_object(
         self, particles: PyTree, objects: Int[Array, "*n"], states: PyTree
@@ -213,7 +218,9 @@ class MultiObjectModel(AbstractStateSpaceModel):
         if not self.per_object or objects.ndim == 0:
             return self.object_at(objects).sample_transition(key, states)
 
-        draw = lambda states, j, key: self.object_at(j).sample_transition(key, states)  # noqa: E731
+        def draw(states: PyTree, j: Int[Array, ""], key: Key[Array, ""]) -> PyTree:
+            return self.object_at(j).sample_transition(key, states)
+
         return _one_by_one(draw, (states,), objects, split(key, objects.shape[0]))
 
     def prepare_observation(self, observation: PyTree) -> PyTree:
@@ -230,17 +237,17 @@ class MultiObjectModel(AbstractStateSpaceModel):
         """log L(y_t | x_t^j) of one object of each particle; y_t as prepared."""
 
         def weigh(states: PyTree, j: Int[Array, "*n"]) -> Any:
-            seen = observation
+            of_object = observation
             if not self.shared_observation:
-                seen = jax.tree.map(lambda leaf: leaf[j], observation)
-            return self.object_at(j).log_likelihood(seen, states)
+                of_object = jax.tree.map(lambda leaf: leaf[j], observation)
+            return self.object_at(j).log_likelihood(of_object, states)
 
         if objects.ndim == 0 or (self.shared_observation and not self.per_object):
             values = weigh(states, objects)
         else:
             values = _one_by_one(weigh, (states,), objects)
         num_particles = jax.tree.leaves(states)[0].shape[0]
-        return check_log_density(values, self.object_model, "log_likelihood", num_particles)
+        return real_each(values, num_particles, self.object_model, "log_likelihood")
 
     def object_log_transition(
         self, states: PyTree, previous_states: PyTree, objects: Int[Array, "*n"]
@@ -298,14 +305,16 @@ def _is_array(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array | np.ndarray)
 
 
-def _one_by_one(function: Callable[..., PyTree], states: tuple[PyTree, ...], *own: Any) -> PyTree:
+def _one_by_one(
+    function: Callable[..., PyTree], states: tuple[PyTree, ...], *others: Any
+) -> PyTree:
     """A function of the states of n particles, called for each with what is its own."""
 
-    def of_one(states: tuple[PyTree, ...], *own: Any) -> PyTree:
-        found = function(*jax.tree.map(lambda leaf: leaf[None], states), *own)
-        return jax.tree.map(lambda leaf: leaf[0], found)
+    def of_one(states: tuple[PyTree, ...], *others: Any) -> PyTree:
+        values = function(*jax.tree.map(lambda leaf: leaf[None], states), *others)
+        return jax.tree.map(lambda leaf: leaf[0], values)
 
-    return jax.vmap(of_one)(states, *own)
+    return jax.vmap(of_one)(states, *others)
 
 
 def _has_axis(model: Any, num_objects: int) -> bool:

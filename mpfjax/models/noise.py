@@ -1,6 +1,5 @@
 """Standard normal and uniform draws: independent, or spread evenly over particles."""
 
-from functools import partial
 from typing import Literal
 
 import jax
@@ -120,15 +119,18 @@ def _ranks_and_shifts(
     """The rank of each slot in its component, and the shift of the component's points."""
     n, d = shape
     ranks = jnp.arange(n, dtype=jnp.int32)
-    dealt = partial(_shuffled_ranks, jax.random.fold_in(key, 1)) if shuffle else lambda own: own
+
+    def dealt(ranks: Int[Array, " n"]) -> Int[Array, " n"]:
+        return _shuffled_ranks(jax.random.fold_in(key, 1), ranks) if shuffle else ranks
+
     if components is None:
         num_components = 1
     shifts = stored(bits(key, (num_components, d)) >> _UNUSED)
     if components is None or num_components == 1:
         return dealt(ranks), shifts.T << _UNUSED
     ranks = stored(ranks - spread(first_places(components, num_components), components))
-    own = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
-    return dealt(ranks), stored(own) << _UNUSED
+    of_slots = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
+    return dealt(ranks), stored(of_slots) << _UNUSED
 
 
 def _shuffled_ranks(key: Key[Array, ""], ranks: Int[Array, " n"]) -> Int[Array, " n"]:

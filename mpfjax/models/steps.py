@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import shown
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models import gaussians
-from mpfjax.models.base import asking, check_log_density, check_moved
+from mpfjax.models.base import asking, check_moved, real_each
 from mpfjax.models.conditionally_linear import (
     emission_of,
     is_marginalised,
@@ -81,7 +81,7 @@ def log_transition(model: Any, draws: PyTree, states: PyTree) -> Float[Array, " 
     with asking(model, "log_transition"):
         values = model.log_transition(draws, drawn_part(model, states))
     num_particles = jax.tree.leaves(draws)[0].shape[0]
-    return check_log_density(values, model, "log_transition", num_particles)
+    return real_each(values, num_particles, model, "log_transition")
 
 
 def likelihoods(model: Any, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
@@ -99,7 +99,7 @@ def seen(
     states, log_density = updated(model, observation, states)
     if log_density is not None:
         num_particles = states.mean.shape[0]
-        log_factors.append(check_log_density(log_density, model, "emission", num_particles))
+        log_factors.append(real_each(log_density, num_particles, model, "emission"))
     return states, log_factors
 
 
@@ -110,7 +110,7 @@ def own_likelihoods(model: Any, observation: PyTree, states: PyTree) -> Float[Ar
     with asking(model, "log_likelihood", f"the observation {shown(observation)}{hint}"):
         values = model.log_likelihood(observation, states)
     num_particles = jax.tree.leaves(states)[0].shape[0]
-    return check_log_density(values, model, "log_likelihood", num_particles)
+    return real_each(values, num_particles, model, "log_likelihood")
 
 
 def log_predictive(
@@ -118,9 +118,9 @@ def log_predictive(
 ) -> Float[Array, " n"]:
     """log p(y_t | z_t, z, y_1..y_{t-1}) of each particle, what is seen of z_t included."""
     log_density = own_likelihoods(model, observation, latent)
-    seen = emission_of(model, latent, state)
-    if seen is None:
+    emission = emission_of(model, latent, state)
+    if emission is None:
         return log_density
     law = predicted_gaussian(model, latent, state)
-    rows = observation_rows(model, observation, seen, state.mean.dtype)
-    return log_density + gaussians.update(law, rows, seen)[1]
+    rows = observation_rows(model, observation, emission, state.mean.dtype)
+    return log_density + gaussians.update(law, rows, emission)[1]

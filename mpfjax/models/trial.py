@@ -15,11 +15,11 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import Count, checked, warn
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
-    check_log_density,
     check_moved,
     check_states,
     is_made_of_noise,
     model_name,
+    real_each,
     require,
     require_noise,
     with_inputs,
@@ -75,7 +75,7 @@ def _faults(key: Key[Array, ""], model: Any, observation: PyTree, inputs: PyTree
     yield from _of_draws("sample_initial", _many_initial(keys[0], model))
     if callable(getattr(model, "log_initial", None)):
         values = model.log_initial(model.sample_initial(key, _DRAWS))
-        if not np.isfinite(check_log_density(values, model, "log_initial", _DRAWS)).all():
+        if not np.isfinite(real_each(values, _DRAWS, model, "log_initial")).all():
             yield "log_initial is NaN or infinite at draws of sample_initial"
     starts = _places(keys[1], model)
     model = with_inputs(model, inputs)
@@ -230,13 +230,13 @@ def _of_transition(
     values += [("x_(t-1)", np.tile(x[:, None], (1, _SIBLINGS, 1))) for x in parents]
     for what, of_siblings in values:
         # Where the shares are right, the expectation of the own value is theirs.
-        own = np.diagonal(of_siblings, axis1=1, axis2=2)
+        of_parent = np.diagonal(of_siblings, axis1=1, axis2=2)
         beside = of_siblings - np.sum(shares * of_siblings, axis=2, keepdims=True)
         excess = np.diagonal(beside, axis1=1, axis2=2).sum()
         deviation = np.sqrt(np.sum(shares * beside**2))
-        beyond = abs(excess) - 1e-3 * own.size * own.std()
+        beyond = abs(excess) - 1e-3 * of_parent.size * of_parent.std()
         if _log_chance(np.sign(excess) * beside, shares, beyond, deviation) < np.log(_LEAST_CHANCE):
-            mean, error = excess / own.size, deviation / own.size
+            mean, error = excess / of_parent.size, deviation / of_parent.size
             yield (
                 "log_transition is not the density of sample_transition: given the x_(t-1) that"
                 f" draws come from, {what} is {mean:.2g} ± {error:.2g} above what it says; does a"
@@ -301,8 +301,8 @@ def steps_ahead(
         at_step = with_inputs(model, now)
         moved = at_step.sample_transition(key_state, state)
         check_moved(moved, state, model)
-        seen = at_step.sample_observation(key_observation, moved)
-        check_states(seen, model, "sample_observation", 1)
-        return moved, jax.tree.map(lambda leaf: leaf[0], (moved, seen))
+        observation = at_step.sample_observation(key_observation, moved)
+        check_states(observation, model, "sample_observation", 1)
+        return moved, jax.tree.map(lambda leaf: leaf[0], (moved, observation))
 
     return jax.lax.scan(advance, state, (jax.random.split(key, num_steps), inputs))[1]

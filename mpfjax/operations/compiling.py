@@ -132,15 +132,15 @@ def keep_programs(folder: str | Path | None = None) -> Path:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         own: str | None = _settings.jax_compilation_cache_dir
         folder = own or caches / "mpfjax"
-    kept = Path(folder)
-    kept.mkdir(parents=True, exist_ok=True)
+    path = Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    if str(kept) != _settings.jax_compilation_cache_dir:
-        jax.config.update("jax_compilation_cache_dir", str(kept))
+    if str(path) != _settings.jax_compilation_cache_dir:
+        jax.config.update("jax_compilation_cache_dir", str(path))
         # An earlier compilation may have decided that there is no cache.
         compilation_cache.reset_cache()
-    return kept
+    return path
 
 
 def is_traced(tree: PyTree) -> bool:

@@ -60,22 +60,18 @@ def largest(values: Shaped[Array, "..."], axis: int | None = None) -> Shaped[Arr
     if not jnp.issubdtype(values.dtype, jnp.floating):
         return jnp.max(values, axis=axis)
     kind = _INTEGERS[values.dtype.itemsize]
-    least = _in_order(jnp.array(-jnp.inf, values.dtype), kind)
-    # Of all integers, the last one is NaN.
-    keys = jnp.where(jnp.isnan(values), jnp.iinfo(kind).max, _in_order(values, kind))
-    found = jnp.max(keys, axis=axis, initial=least)
-    return jax.lax.bitcast_convert_type(_mirrored(found, kind), values.dtype)
-
-
-def _in_order(values: Shaped[Array, "..."], kind: type) -> Int[Array, "..."]:
-    """The bits as integers in the order of the values."""
-    return _mirrored(jax.lax.bitcast_convert_type(values, kind), kind)
-
-
-def _mirrored(bits: Int[Array, "..."], kind: type) -> Int[Array, "..."]:
-    """The other bits of those with a sign, inverted: their order, and back."""
     info = jnp.iinfo(kind)
-    return bits ^ ((bits >> (info.bits - 1)) & info.max)
+
+    def mirrored(bits: Int[Array, "..."]) -> Int[Array, "..."]:
+        # Those with a sign have their other bits inverted: the order of the values, and back.
+        return bits ^ ((bits >> (info.bits - 1)) & info.max)
+
+    least = mirrored(jax.lax.bitcast_convert_type(jnp.array(-jnp.inf, values.dtype), kind))
+    keys = mirrored(jax.lax.bitcast_convert_type(values, kind))
+    # Of all integers, the last one is NaN.
+    keys = jnp.where(jnp.isnan(values), info.max, keys)
+    most = jnp.max(keys, axis=axis, initial=least)
+    return jax.lax.bitcast_convert_type(mirrored(most), values.dtype)
 
 
 def exp(log_values: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
@@ -129,17 +125,13 @@ def softmax(log_values: Float[Array, " n"]) -> Float[Array, " n"]:
     values, _ = scaled_exp(log_values)
     total = jnp.sum(values)
     shares = values / jnp.where(total == 0, 1.0, total)
-    return masked_shares(log_values, shares)
+    # Without a gradient at -inf, where that of later operations may not be finite.
+    return jnp.where(log_values == -jnp.inf, 0.0, shares)
 
 
 def finite_or_zero(largest: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
     """What to subtract from a logarithm: the value itself, or 0 if that is infinite or NaN."""
     return jnp.where(jnp.isfinite(largest), largest, 0.0)
-
-
-def masked_shares(log_values: Float[Array, " n"], shares: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The shares without a gradient at -inf, where that of later operations may not be finite."""
-    return jnp.where(log_values == -jnp.inf, 0.0, shares)
 
 
 def log_or_nothing(total: Float[Array, " *shape"]) -> Float[Array, " *shape"]:

@@ -63,12 +63,13 @@ def _scanned_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"],
 def _blocked_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     n = values.shape[0]
     if n <= _ONE_BLOCK:
-        sums = (values[None] @ _ones_before(n, whole_blocks(n + 1), values.dtype))[0]
+        ones_before = jnp.triu(jnp.ones((n, whole_blocks(n + 1)), values.dtype), 1)
+        sums = (values[None] @ ones_before)[0]
         return sums[:n], sums[n]
     blocks = whole(values, 0.0).reshape(-1, block_size(n))
     size = blocks.shape[1]
     # Columns are summed in the same order, so the sum does not change where the value is zero.
-    within = blocks @ _ones_before(size, size, values.dtype)
+    within = blocks @ jnp.triu(jnp.ones((size, size), values.dtype), 1)
     totals = within[:, -1] + blocks[:, -1]
     # A zero in the last block has the sum of all values before it.
     before, _ = _blocked_sum_before(jnp.pad(totals, (0, 1)))
@@ -78,11 +79,6 @@ def _blocked_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"],
     # The order of summing changes between blocks: zeros at a block's end belong to the next.
     sums = jnp.where(within == totals[:, None], upto, jnp.minimum(before[:-1, None] + within, upto))
     return sums.reshape(-1)[:n], before[-1]
-
-
-def _ones_before(num_rows: int, num_columns: int, dtype: jnp.dtype) -> Float[Array, "rows columns"]:
-    """The matrix with ones above its diagonal."""
-    return jnp.triu(jnp.ones((num_rows, num_columns), dtype), 1)
 
 
 def count_upto(values: Shaped[Array, " n"], bound: int) -> Int[Array, " n"]:
@@ -182,12 +178,6 @@ def needs_two_parts(num_values: int, dtype: jnp.dtype) -> bool:
     return num_values > MOST_IN_ONE_FLOAT and jnp.finfo(dtype).nmant < 32
 
 
-def as_positions(values: Float[Array, " n"]) -> Positions:
-    """Numbers that are not negative, in two parts."""
-    whole = jnp.floor(values)
-    return Positions(to_int(whole, values.shape[0]), values - whole)
-
-
 def exact_sum_before(values: Float[Array, " n"]) -> tuple[Positions, Positions]:
     """The exclusive prefix sums of values >= 0, shape (n,), and the sum of all, shape (1,).
 
@@ -210,8 +200,7 @@ def _scanned(whole: Float[Array, " n"], parts: Float[Array, " n"]) -> tuple[Posi
     carried = (upto < words) | is_one
     whole_upto = jnp.cumsum(whole.astype(jnp.int32) + carried.astype(jnp.int32), dtype=jnp.int32)
     fractions = (upto >> 8).astype(whole.dtype) / _HALF**2
-    first = lambda row: jnp.pad(row[:-1], (1, 0))  # noqa: E731
-    before = Positions(first(whole_upto), first(fractions))
+    before = Positions(jnp.pad(whole_upto[:-1], (1, 0)), jnp.pad(fractions[:-1], (1, 0)))
     return before, Positions(whole_upto[-1:], fractions[-1:])
 
 

@@ -8,8 +8,8 @@ in each cell of many grids of 2^m equal cells (a net), and so have those from an
 
 import functools
 import math
-from collections.abc import Sequence
-from functools import partial, reduce
+from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import jax
@@ -28,14 +28,19 @@ _SHORT_ROW = 8
 _FEW = 256
 # Giles (2010), "Approximating the erfinv function", table 5, highest power first: erf⁻¹(x) / x as
 # a polynomial in w - 2.5 where w = -log(1 - x²) is below 5, and in √w - 3 beyond.
-_CENTRE = (2.81022636e-08, 3.43273939e-07, -3.5233877e-06, -4.39150654e-06, 0.00021858087,
-           -0.00125372503, -0.00417768164, 0.246640727, 1.50140941)  # fmt: skip
-_TAIL = (-0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773,
-         -0.0076224613, 0.00943887047, 1.00167406, 2.83297682)  # fmt: skip
+_CENTRE = np.float32([
+    2.81022636e-08, 3.43273939e-07, -3.5233877e-06, -4.39150654e-06, 0.00021858087,
+    -0.00125372503, -0.00417768164, 0.246640727, 1.50140941,
+])  # fmt: skip
+_TAIL = np.float32([
+    -0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773,
+    -0.0076224613, 0.00943887047, 1.00167406, 2.83297682,
+])  # fmt: skip
 # Moshier's Cephes library, logf: (log(1 + f) - f + f²/2) / f³ for 1 + f in [√½, √2].
-_LOGARITHM = (7.0376836292e-2, -1.1514610310e-1, 1.1676998740e-1, -1.2420140846e-1,
-              1.4249322787e-1, -1.6668057665e-1, 2.0000714765e-1, -2.4999993993e-1,
-              3.3333331174e-1)  # fmt: skip
+_LOGARITHM = np.float32([
+    7.0376836292e-2, -1.1514610310e-1, 1.1676998740e-1, -1.2420140846e-1, 1.4249322787e-1,
+    -1.6668057665e-1, 2.0000714765e-1, -2.4999993993e-1, 3.3333331174e-1,
+])  # fmt: skip
 _ROOT_OF_HALF = 0x3F3504F3
 _FRACTION = 0x7FFFFF
 # Joe and Kuo (2008), "Constructing Sobol sequences with better two-dimensional projections", the
@@ -183,10 +188,7 @@ def normal_quantile(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     exponent = -_log((1 - values) * (1 + values))
     is_central = exponent < 5
     powers = jnp.where(is_central, exponent - 2.5, jnp.sqrt(exponent) - 3.0)
-    coefficients = [
-        jnp.where(is_central, np.float32(central), np.float32(tail))
-        for central, tail in zip(_CENTRE, _TAIL, strict=True)
-    ]
+    coefficients = map(partial(jnp.where, is_central), _CENTRE, _TAIL)
     return np.float32(math.sqrt(2)) * _polynomial(coefficients, powers) * values
 
 
@@ -197,13 +199,17 @@ def _log(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     exponent = (bits >> 23).astype(jnp.float32)
     mantissa = jax.lax.bitcast_convert_type((bits & _FRACTION) + _ROOT_OF_HALF, jnp.float32)
     f = mantissa - 1
-    series = _polynomial([np.float32(coefficient) for coefficient in _LOGARITHM], f)
+    series = _polynomial(_LOGARITHM, f)
     return exponent * np.float32(math.log(2)) + (f + f * f * (f * series - 0.5))
 
 
-def _polynomial(coefficients: Sequence[Any], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def _polynomial(coefficients: Iterable[Any], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """The polynomial; the coefficient of the highest power comes first."""
-    return reduce(lambda value, coefficient: value * x + coefficient, coefficients)
+    highest, *others = coefficients
+    value = highest
+    for coefficient in others:
+        value = value * x + coefficient
+    return value
 
 
 def _random_bits(key: UInt32[Array, " 2"], bit_width: int, shape: tuple[int, ...]) -> Array:
@@ -367,8 +373,8 @@ def scrambled_directions(
     point is uniform, and any two have the joint law that they have in Owen's nested scramble.
     """
     directions = jnp.asarray(direction_numbers(dimension, num_digits))
-    own = jnp.uint32(1) << jnp.arange(_DIGITS - 1, -1, -1, dtype=jnp.uint32)
-    before = ~(own | (own - 1))
-    matrices = (bits(key, (dimension, _DIGITS)) & before[None]) | own[None]
+    digit = jnp.uint32(1) << jnp.arange(_DIGITS - 1, -1, -1, dtype=jnp.uint32)
+    before = ~(digit | (digit - 1))
+    matrices = (bits(key, (dimension, _DIGITS)) & before[None]) | digit[None]
     parities = jax.lax.population_count(matrices[:, None] & directions[:, :, None]) & 1
-    return jnp.sum(parities * own[None, None], axis=2, dtype=jnp.uint32)
+    return jnp.sum(parities * digit[None, None], axis=2, dtype=jnp.uint32)

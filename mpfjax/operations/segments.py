@@ -21,13 +21,11 @@ from mpfjax.operations.logarithms import (
     finite_or_zero,
     largest,
     log_or_nothing,
-    masked_shares,
 )
 from mpfjax.operations.prefix_sums import count_starts
 from mpfjax.operations.stored import (
     EXACT_IN_FLOAT32,
     block_size,
-    from_the_start,
     stored,
     take,
 )
@@ -65,11 +63,9 @@ def spread(
     if num_segments > FEW_CHOICES:
         return take(stored(values), segments)
     shape = (*segments.shape, *values.shape[1:])
-    cases = [
-        jnp.broadcast_to(jax.lax.slice_in_dim(values, m, m + 1), shape) for m in range(num_segments)
-    ]
     if num_segments == 1:
-        return cases[0]
+        return jnp.broadcast_to(values, shape)
+    cases = [jnp.broadcast_to(value, shape) for value in jnp.split(values, num_segments)]
     which = jax.lax.broadcast_in_dim(segments.astype(jnp.int32), shape, (0,))
     return jax.lax.select_n(which, *cases)
 
@@ -88,15 +84,10 @@ def column_sums(
     columns: Float[Array, "c n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, "num_segments c"]:
     """`segment_sum` of values that lie column by column, each entry beside the next."""
-
-    def sums(column: Float[Array, " n"]) -> Float[Array, " num_segments"]:
-        if not are_masked(len(column), num_segments):
-            return _scattered_sum(column, segments, num_segments)
-        return segment_reduce("add", column, segments, num_segments, 0)
-
+    sums = partial(segment_reduce, "add", segments=segments, num_segments=num_segments)
     if len(columns) <= _FEW_COLUMNS:
         # A sum of several columns at once would be of columns that are chosen number by number.
-        return jnp.stack([sums(column) for column in columns], 1)
+        return jnp.stack(list(map(sums, columns)), 1)
     return jax.vmap(sums)(columns).T
 
 
@@ -124,12 +115,12 @@ def segment_any(
     bits = jnp.uint32(1) << bit
     words = []
     for word in range(-(-num_segments // _WORD)):
-        own = jnp.where(mask & (word_of == word), bits, jnp.uint32(0))
-        words.append(jax.lax.reduce(own, np.uint32(0), jax.lax.bitwise_or, (0,)))
+        of_word = jnp.where(mask & (word_of == word), bits, jnp.uint32(0))
+        words.append(jax.lax.reduce(of_word, np.uint32(0), jax.lax.bitwise_or, (0,)))
     # Not gathered by label: XLA would read all particles again for each.
     shifts = jnp.arange(_WORD, dtype=jnp.uint32)
-    found = (jnp.stack(words)[:, None] >> shifts[None]) & 1 > 0
-    return found.reshape(-1)[:num_segments]
+    occurs = (jnp.stack(words)[:, None] >> shifts[None]) & 1 > 0
+    return occurs.reshape(-1)[:num_segments]
 
 
 def segment_reduce(
@@ -137,15 +128,20 @@ def segment_reduce(
     values: Shaped[Array, " n"],
     segments: Int[Array, " n"],
     num_segments: int,
-    nothing: float,
+    nothing: float = 0,
 ) -> Shaped[Array, " num_segments"]:
-    """The sum ("add"), "max" or "min" of each segment's values, `nothing` for an empty one."""
+    """The sum ("add"), "max" or "min" of each segment's values, `nothing` for an empty one.
+
+    Of these the sum has a derivative.
+    """
     if not are_masked(len(values), num_segments):
+        if how == "add":
+            return _scattered_sum(values, segments, num_segments)
         return _scattered(how, values, segments, num_segments, nothing)
     # XLA fuses the masks into the sum and never stores them.
     is_member = segments[None] == jnp.arange(num_segments, dtype=segments.dtype)[:, None]
-    own = jnp.where(is_member, values[None], nothing)
-    return _REDUCTIONS[how](own.astype(values.dtype), axis=1)
+    of_each = jnp.where(is_member, values[None], nothing)
+    return _REDUCTIONS[how](of_each.astype(values.dtype), axis=1)
 
 
 @partial(jax.jit, static_argnames="num_segments")
@@ -192,7 +188,7 @@ def _scattered(
     # loop, and not see any more that two sums by the same labels use the same places.
     places = labels * num_lanes + jax.lax.broadcasted_iota(jnp.int32, labels.shape, 1)
     line = jnp.full((num_segments + 1) * num_lanes, initial, values.dtype)
-    combine = getattr(line.at[from_the_start(places.reshape(-1))], how)
+    combine = getattr(line.at[places.reshape(-1).astype(jnp.uint32)], how)
     lines = combine(jnp.pad(jax.lax.stop_gradient(values), padding), mode="promise_in_bounds")
     lines = lines.reshape(-1, num_lanes)[:num_segments]
     return _REDUCTIONS[how](lines, axis=1).astype(values.dtype)
@@ -202,11 +198,11 @@ def segment_log_sum_exp(
     log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " num_segments"]:
     """log Σ exp in each segment, -inf in one that is empty or holds nothing but -inf."""
-    values, shift = _relative(log_values, segments, num_segments)
+    values, shift = scaled_exp_of_segments(log_values, segments, num_segments)
     return log_or_nothing(segment_sum(values, segments, num_segments)) + shift
 
 
-def _relative(
+def scaled_exp_of_segments(
     log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> tuple[Float[Array, " n"], Float[Array, " num_segments"]]:
     """exp of the values divided by their segment's largest, and the logarithm of that."""
@@ -219,13 +215,14 @@ def segment_softmax(
     log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " n"]:
     """exp of the values as shares of their segment's sum, zero where that sum is zero."""
-    values, _ = _relative(log_values, segments, num_segments)
+    values, _ = scaled_exp_of_segments(log_values, segments, num_segments)
     totals = segment_sum(values, segments, num_segments)
     shares = values / spread(jnp.where(totals == 0, 1.0, totals), segments)
     if not are_masked(len(values), num_segments):
         # Otherwise XLA takes the totals by a scatter, one particle after the other.
         shares = stored(shares)
-    return masked_shares(log_values, shares)
+    # As in `softmax`: without a gradient at -inf.
+    return jnp.where(log_values == -jnp.inf, 0.0, shares)
 
 
 def segment_argmax(
@@ -286,9 +283,10 @@ class SideBySide(NamedTuple):
         ends = self.ends.reshape(-1)
         # A segment that lies in one block has it twice.
         counts = jnp.concatenate([jnp.ones(m, bool), self.ends[0] < self.ends[1]])
-        own = take(self.labels, ends) == jnp.tile(jnp.arange(m, dtype=labels.dtype), 2)[:, None]
-        own &= (counts & ~take(is_whole, ends))[:, None]
-        outer = jnp.where(own, take(blocks, ends), nothing).astype(values.dtype)
+        label = jnp.tile(jnp.arange(m, dtype=labels.dtype), 2)
+        is_member = take(self.labels, ends) == label[:, None]
+        is_member &= (counts & ~take(is_whole, ends))[:, None]
+        outer = jnp.where(is_member, take(blocks, ends), nothing).astype(values.dtype)
         return reduced(jnp.stack([inner, *reduced(outer, axis=1).reshape(2, m)]), axis=0)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 _only_the_default_forms = False  # set by tests, which try them without a GPU
 VECTOR = 32
@@ -47,9 +47,12 @@ def whole_blocks(n: int) -> int:
 
 
 def block_size(n: int) -> int:
+    """The length of the blocks of a prefix sum over n values."""
     # Operations fused with a padding, or a division by an odd size, are not vectorised.
-    whole = (size for size in _BLOCKS if n % size == 0 and n > VECTOR)
-    return next(whole, VECTOR)
+    for size in _BLOCKS:
+        if n % size == 0 and n > VECTOR:
+            return size
+    return VECTOR
 
 
 def whole(values: Shaped[Array, " n"], fill: float) -> Shaped[Array, " p"]:
@@ -65,7 +68,7 @@ def stored(values: Shaped[Array, "*rest n"]) -> Shaped[Array, "*rest n"]:
     XLA would compute them again wherever they are used: once for every particle, even if there is
     one for each component, and without vectors in a scatter or gather over flattened rows.
     """
-    return on_platform(values, cpu=_through_a_call, default=lambda values: values)
+    return on_platform(values, cpu=_through_a_call, default=_same)
 
 
 @stored.defjvp
@@ -102,28 +105,26 @@ def to_int(
 
 
 def take(values: Array, indices: Int[Array, " n"]) -> Array:
-    """values[indices] for indices that are known to lie in range."""
-    return values.at[from_the_start(indices)].get(mode="promise_in_bounds")
+    """values[indices] for indices that are known to lie in range.
 
-
-def from_the_start(indices: Int[Array, "*shape"]) -> UInt32[Array, "*shape"]:
-    """Indices without a sign, so that JAX does not check whether they count from the end."""
-    return indices.astype(jnp.uint32)
+    Here and below they have no sign, so that JAX does not check whether they count from the end.
+    """
+    return values.at[indices.astype(jnp.uint32)].get(mode="promise_in_bounds")
 
 
 def count_places(
     places: Int[Array, " n"], num_places: int, dtype: DTypeLike = jnp.int32
 ) -> Shaped[Array, " num_places"]:
     """How many of the entries name each place, all of which must be in [0, num_places)."""
-    counts = jnp.zeros(num_places, dtype).at[from_the_start(places)]
+    counts = jnp.zeros(num_places, dtype).at[places.astype(jnp.uint32)]
     return counts.add(1, mode="promise_in_bounds")
 
 
 def inverse_permutation(places: Int[Array, " n"]) -> Int[Array, " n"]:
     """The index at each place, given every index's place."""
     index = jnp.arange(places.shape[0], dtype=jnp.int32)
-    found = jnp.zeros_like(index).at[from_the_start(stored(places))]
-    return found.set(index, mode="promise_in_bounds", unique_indices=True)
+    inverse = jnp.zeros_like(index).at[stored(places).astype(jnp.uint32)]
+    return inverse.set(index, mode="promise_in_bounds", unique_indices=True)
 
 
 def cond_if_any(
@@ -148,8 +149,11 @@ def drawn_once(key: Key[Array, "*num"], draw: Callable[..., PyTree]) -> PyTree:
         return draw(key)
     function = partial(draw, key)
     holds = any_run(jnp.all(jax.lax.population_count(jax.random.key_data(key)) <= 32))
-    shapes = jax.eval_shape(function)
-    nothing = lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)  # noqa: E731
+
+    def nothing() -> PyTree:
+        shapes = jax.eval_shape(function)
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
     return jax.lax.cond(holds, function, nothing)
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import check_log_density, with_inputs
+from mpfjax.models.base import real_each, with_inputs
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.prefix_sums import (
@@ -76,7 +76,7 @@ def log_transition_from(model: Any, mixture: ParticleMixture) -> Callable[[PyTre
     def log_density(state: PyTree) -> Float[Array, " n"]:
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), state)
         values = model.log_transition(copies, mixture.particles)
-        return check_log_density(values, model, "log_transition", n)
+        return real_each(values, n, model, "log_transition")
 
     return log_density
 
@@ -140,7 +140,7 @@ def walk(
     def log_density(indices: Int[Array, " k"]) -> Float[Array, " k"]:
         previous = jax.tree.map(lambda leaf: take(leaf, indices), mixture.particles)
         values = model.log_transition(next_states, previous)
-        check_log_density(values, model, "log_transition", num_states)
+        real_each(values, num_states, model, "log_transition")
         return values
 
     def move(

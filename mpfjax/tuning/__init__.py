@@ -1,5 +1,8 @@
 """Tuning of a filter's parameters by gradients, and their posterior."""
 
+from mpfjax.tuning.bijections import Interval as Interval
+from mpfjax.tuning.bijections import Positive as Positive
+from mpfjax.tuning.bijections import Simplex as Simplex
 from mpfjax.tuning.curvature import standard_errors as standard_errors
 from mpfjax.tuning.densities import log_density as log_density
 from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
@@ -10,6 +13,3 @@ from mpfjax.tuning.optimisation import maximise as maximise
 from mpfjax.tuning.predictive import posterior_predictive as posterior_predictive
 from mpfjax.tuning.predictive import to_inference_data as to_inference_data
 from mpfjax.tuning.sequential import smc2 as smc2
-from mpfjax.tuning.transforms import Interval as Interval
-from mpfjax.tuning.transforms import Positive as Positive
-from mpfjax.tuning.transforms import Simplex as Simplex

@@ -115,7 +115,10 @@ class Sampling(Checked):
         at = eqx.filter_eval_shape(self._chains_at, kernel, key_starts, starts)
         report = eqx.filter_eval_shape(_one_step, kernel, key_steps, at[0], 0).report
         none = jax.tree.map(lambda leaf: np.empty((0, *leaf.shape), leaf.dtype), report)
-        start = lambda: State(0, self._started(kernel, key_starts, starts), none)  # noqa: E731
+
+        def start() -> State:
+            return State(0, self._started(kernel, key_starts, starts), none)
+
         advance = self._advance(kernel, key_steps, report)
         state, stopped = run.go(State(0, at[0], none), start, advance)
         draws = jax.tree.map(lambda rows: np.moveaxis(rows[:num_draws], 0, 1), state.rows)
@@ -129,8 +132,10 @@ class Sampling(Checked):
         """Where each chain starts: the filter's own parameters, or a draw of the prior."""
         if self.sample_prior is not None:
             return drawn(key, self.problem, self.sample_prior, self.num_chains)
-        repeat = lambda u: jnp.broadcast_to(u, (self.num_chains, *u.shape))  # noqa: E731
-        return jax.tree.map(repeat, self.problem.start())
+        return jax.tree.map(
+            lambda reals: jnp.broadcast_to(reals, (self.num_chains, *reals.shape)),
+            self.problem.start(),
+        )
 
     def _chains_at(
         self, kernel: AbstractKernel, key: Key[Array, ""], reals: Reals

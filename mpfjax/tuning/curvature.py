@@ -10,9 +10,9 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, checked, warn
 from mpfjax.filter import Filter
+from mpfjax.tuning.bijections import Unconstrained
 from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms, score_of_each
-from mpfjax.tuning.transforms import Unconstrained
 
 _MOST_NUMBERS = 50
 # The range of the squared step, relative to 1 / I, that is near enough to one standard error.
@@ -92,7 +92,10 @@ def errors_at(
     _warn_of_noise(informations, of_seeds)
     # By the Jacobian of the parameters on their own scale, laid out in the same order.
     _, shaped = ravel_pytree(problem.constrain(reals))
-    constrain = lambda flat: ravel_pytree(problem.constrain(unravel(flat)))[0]  # noqa: E731
+
+    def constrain(flat: Float[Array, " d"]) -> Float[Array, " d"]:
+        return ravel_pytree(problem.constrain(unravel(flat)))[0]
+
     jacobian = np.asarray(jax.jacfwd(constrain)(point), float)
     variances = np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)
     return jax.tree.map(np.asarray, shaped(jnp.asarray(np.sqrt(variances), point.dtype)))

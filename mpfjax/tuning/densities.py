@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import checked, shown
+from mpfjax.tuning.bijections import AbstractTransform
 from mpfjax.tuning.evidence import UnbiasedFilter, pose_evidence
 from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms
-from mpfjax.tuning.transforms import AbstractTransform
 
 LogPrior = Callable[[dict[str, Array]], Float[Array, ""] | float]
 SamplePrior = Callable[[Key[Array, ""]], Mapping[str, Array]]

@@ -38,7 +38,10 @@ class LogEvidence(eqx.Module):
 
     def runs(self, key: Key[Array, ""], filter: Filter) -> list[FilterRun]:
         """The runs of each group, with nothing collected."""
-        run = lambda key, series: scan(key, filter, series, lambda mixture: None)  # noqa: E731
+
+        def run(key: Key[Array, ""], series: Series) -> FilterRun:
+            return scan(key, filter, series, lambda mixture: None)
+
         return [
             jax.vmap(run)(jax.random.split(jax.random.fold_in(key, g), group.length), group)
             for g, group in enumerate(self.groups)

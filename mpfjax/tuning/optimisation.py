@@ -180,7 +180,10 @@ class _Ascent:
         start = State(0, (reals, optimizer), (np.empty(0), np.empty(0), no_path))
         settings = {"key": self.key, "num_seeds": int(self.num_seeds)}
         settings |= self.problem.settings | data
-        first = lambda reals: self._updated(reals, self.optimizer.init(reals), reals)  # noqa: E731
+
+        def first(reals: Reals) -> Any:
+            return self._updated(reals, self.optimizer.init(reals), reals)
+
         functions |= {"optimizer": (first, reals)}
         identity = identity_of(checkpoint, settings, functions)
         run = LongRun(self.caller, num_steps, checkpoint, progress, lambda step: identity)

@@ -1,6 +1,7 @@
 """Particles of parameters, each with a filter of its own: the step of `smc2`."""
 
 import dataclasses
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -160,7 +161,7 @@ def rejuvenated(sampler, key, samples, num_steps):
     resampled = Resample(particles_per_component=num_chains)(key_resample, samples)
     starts = jax.tree.map(lambda leaf: leaf[:num_chains], resampled.particles)
 
-    evaluate = lambda key, reals: sampler.run_again(key, reals, num_steps)  # noqa: E731
+    evaluate = partial(sampler.run_again, num_steps=num_steps)
 
     def chain(key: Key[Array, ""], sample: Point) -> tuple[Point, Any]:
         def advance(sample: Point, key: Key[Array, ""]) -> tuple[Point, Any]:

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import by_name, shown
-from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
+from mpfjax.tuning.bijections import AbstractTransform, Unconstrained
 
 _DECLARED = "eqx.field(converter=jnp.asarray)"
 
@@ -211,16 +211,14 @@ def _picked(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[st
         picked = where(places)
     except (AttributeError, IndexError, KeyError, TypeError) as error:
         raise ValueError(f"parameters: {name} cannot be picked: {error}") from error
-    found = jax.tree_util.tree_leaves_with_path(picked)
-    for _, place in found:
+    picks = jax.tree_util.tree_leaves_with_path(picked)
+    for _, place in picks:
         if not isinstance(place, Place):
             said = f"{name} picks {shown(place)}, a static field or a new value"
             raise ValueError(f"parameters: {said}; declare its field {_DECLARED}")
-    if len(found) > 1 or not name:  # a network has functions among its leaves
-        found = [
-            (path, place) for path, place in found if eqx.is_inexact_array(leaves[place.index])
-        ]
-    if not found and name:
+    if len(picks) > 1 or not name:  # a network has functions among its leaves
+        picks = [pick for pick in picks if eqx.is_inexact_array(leaves[pick[1].index])]
+    if not picks and name:
         raise ValueError(f"parameters: {name} picks no array")
-    called = lambda path: (name + jax.tree_util.keystr(path)).removeprefix(".")  # noqa: E731
-    return {called(path): place.index for path, place in found}
+    names = ((name + jax.tree_util.keystr(path)).removeprefix(".") for path, _ in picks)
+    return dict(zip(names, (place.index for _, place in picks), strict=True))

@@ -199,9 +199,10 @@ class _Run:
         )
         if (before.present is None) != (after.present is None):
             before, after = with_present(before), with_present(after)
-        one_step = lambda series: kinds(jax.tree.map(lambda leaf: leaf[-1], series))  # noqa: E731
-        if one_step(before) != one_step(after):
-            here, there = one_step(after), one_step(before)
+        there, here = (
+            kinds(jax.tree.map(lambda leaf: leaf[-1], series)) for series in (before, after)
+        )
+        if there != here:
             raise ValueError(f"observations: {here} is not like those before, {there}")
         series = jax.tree.map(lambda *leaves: np.concatenate(leaves), before, after)
         held = self.sampler.run.series.length
@@ -280,5 +281,8 @@ class _Run:
 
 def _padded(series: Series, capacity: int) -> FilterOf:
     """Runs over the data, in arrays with room for this many steps."""
-    pad = lambda leaf: jnp.asarray(np.resize(leaf, (capacity, *leaf.shape[1:])))  # noqa: E731
+
+    def pad(leaf: np.ndarray) -> Array:
+        return jnp.asarray(np.resize(leaf, (capacity, *leaf.shape[1:])))
+
     return FilterOf(jax.tree.map(pad, series))

@@ -10,8 +10,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mpfjax.checks import POSITIVE, Checked, check_shape, saying, to_numbers
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero
-from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread
+from mpfjax.operations.logarithms import as_inexact
+from mpfjax.operations.segments import are_masked, column_sums, scaled_exp_of_segments, spread
 from mpfjax.operations.stored import stored
 
 # Up to this many features are multiplied one by one, which runs on vectors.
@@ -105,12 +105,10 @@ class Groups(eqx.Module):
 
 def relative_weights(mixture: ParticleMixture) -> Float[Array, " n"]:
     """The weights within each component, in units of its largest; a dead one's are zero."""
-    log_weights, labels = mixture.log_weights, mixture.component_indicators
-    largest = finite_or_zero(segment_max(log_weights, labels, mixture.num_components))
-    weights = exp(log_weights - spread(largest, labels))
+    labels, m = mixture.component_indicators, mixture.num_components
+    weights, _ = scaled_exp_of_segments(mixture.log_weights, labels, m)
     # Otherwise XLA takes the maximum by a scatter, one particle after the other.
-    is_kept = are_masked(mixture.num_particles, mixture.num_components)
-    return weights if is_kept else stored(weights)
+    return weights if are_masked(mixture.num_particles, m) else stored(weights)
 
 
 def weighted_means(

@@ -95,9 +95,9 @@ def nearest(
     """
     n, m = features.shape[0], centroids.shape[0]
     centroids = jnp.where(alive[:, None], centroids, jnp.inf)
-    found = jnp.full(n, jnp.inf, features.dtype), jnp.zeros(n, jnp.int32)
+    so_far = jnp.full(n, jnp.inf, features.dtype), jnp.zeros(n, jnp.int32)
     if m <= _AT_ONCE:
-        return _nearer(found, features, centroids, 0)[1]
+        return _nearer(so_far, features, centroids, 0)[1]
     padding = -m % _AT_ONCE
     centroids = jnp.pad(centroids, ((0, padding), (0, 0)), constant_values=jnp.inf)
     passes = centroids.reshape(-1, _AT_ONCE, centroids.shape[1])
@@ -105,19 +105,19 @@ def nearest(
     return jax.lax.fori_loop(
         0,
         most_of_runs(last // _AT_ONCE + 1),
-        lambda i, found: _nearer(found, features, passes[i], i * _AT_ONCE),
-        found,
+        lambda i, so_far: _nearer(so_far, features, passes[i], i * _AT_ONCE),
+        so_far,
     )[1]
 
 
 def _nearer(
-    found: tuple[Float[Array, " n"], Int[Array, " n"]],
+    so_far: tuple[Float[Array, " n"], Int[Array, " n"]],
     features: Float[Array, "n k"],
     centroids: Float[Array, "m k"],
     first: int | Int[Array, ""],
 ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
     """The least squared distance so far and whose it is, after these centroids as well."""
-    best, labels = found
+    best, labels = so_far
     for m in range(centroids.shape[0]):
         distance = row_sums((features - centroids[m][None]) ** 2)
         closer = distance < best

@@ -96,7 +96,7 @@ def lowest_connected(adjacent: Bool[Array, "m m"]) -> Int[Array, " m"]:
     until none changes.
     """
     m = adjacent.shape[0]
-    own = jnp.arange(m, dtype=jnp.int32)
+    label = jnp.arange(m, dtype=jnp.int32)
     reach = adjacent | jnp.eye(m, dtype=bool)
 
     def lower(state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -105,7 +105,7 @@ def lowest_connected(adjacent: Bool[Array, "m m"]) -> Int[Array, " m"]:
         lowest = take(lowest, lowest)
         return lowest, jnp.any(lowest != labels)
 
-    labels, _ = jax.lax.while_loop(lambda state: state[1], lower, (own, jnp.ones((), bool)))
+    labels, _ = jax.lax.while_loop(lambda state: state[1], lower, (label, jnp.ones((), bool)))
     return labels
 
 

@@ -147,15 +147,15 @@ def free_labels(
     wanted: Bool[Array, " m"], priority: Float[Array, " m"], active: Bool[Array, " m"]
 ) -> Int[Array, " m"]:
     """A free label for each component that wants one, by priority; its own where none is left."""
-    own = jnp.arange(active.shape[0], dtype=jnp.int32)
-    earlier = own[:, None] < own[None]
+    component = jnp.arange(active.shape[0], dtype=jnp.int32)
+    earlier = component[:, None] < component[None]
     ties = (priority[:, None] == priority[None]) & earlier
     goes_first = wanted[:, None] & ((priority[:, None] > priority[None]) | ties)
     rank = jnp.sum(goes_first, axis=0, dtype=jnp.int32)
     free_rank = few_upto(~active) - 1
     matches = ~active[None] & (rank[:, None] == free_rank[None])
-    label = jnp.max(jnp.where(matches, own[None], -1), axis=1)
-    return jnp.where(wanted & (label >= 0), label, own)
+    label = jnp.max(jnp.where(matches, component[None], -1), axis=1)
+    return jnp.where(wanted & (label >= 0), label, component)
 
 
 def _nearer(

@@ -2,7 +2,8 @@
 
 A scheme returns the first slot of every particle's offspring. Each particle has an interval of the
 line, as long as its expected number of offspring k_m w_i, and the scheme places one point in the
-unit interval of each slot. To add a scheme, write such a function and name it in `SCHEMES`.
+unit interval of each slot and counts those before the particle's. To add a scheme, write such a
+function and name it in `SCHEMES`.
 
 A particle may be kept, as conditional SMC does: it then has one offspring at least. The offspring
 of all have their ordinary law, given that one slot of its component, each with equal probability,
@@ -81,19 +82,23 @@ def draw_ancestors(
     particle `keep` has an offspring whatever is drawn; it must be drawn from, or stay, in `line`.
     """
     slots = place_slots(targets, num_slots)
-    expected = line.expected(targets)
+    shares = targets.astype(line.totals.dtype) / jnp.where(line.totals > 0, line.totals, 1.0)
+    expected = line.weights * line.of_places(shares)
     before, is_inside = line.positions(expected, targets, slots.firsts)
     kept = None
     if keep is not None:
         key, key_kept = split(key, 2)
-        place = line.place_of(keep)
-        own = jnp.zeros((), jnp.int32) if line.components is None else line.components[place]
-        kept = Kept(place, own, uniform(key_kept, (_MOST_LEVELS + 2,), expected.dtype))
+        place, component = keep, jnp.zeros((), jnp.int32)
+        if line.order is not None and line.components is not None:
+            place = jnp.argmax(line.order == keep).astype(jnp.int32)
+            component = line.components[place]
+        kept = Kept(place, component, uniform(key_kept, (_MOST_LEVELS + 2,), expected.dtype))
     starts = SCHEMES[scheme](key, Dealt(line, targets, slots, expected, before, kept))
     # Rounding must not give a slot to particles after the last weight, nor cross a border.
     num_filled = jnp.sum(targets, dtype=jnp.int32)
     starts = jnp.where(is_inside, jnp.minimum(starts, num_filled), num_filled)
-    firsts, lasts = (spread(ends, slots.components) for ends in line.extents(drawn=True))
+    firsts, lasts = line.extents(drawn=True)
+    firsts, lasts = spread(firsts, slots.components), spread(lasts, slots.components)
     parents = jnp.clip(count_starts(starts, num_slots), firsts, lasts)
     if due is not None:
         parents = jnp.where(spread(due, slots.components), parents, firsts + slots.ranks)
@@ -108,14 +113,18 @@ def draw_ancestors(
         first, most = slots.firsts[kept.component], targets[kept.component]
         slot = jnp.clip(slot, first, first + jnp.maximum(most, 1) - 1)
         parents = parents.at[slot].set(kept.place)
-    return Ancestors(line.particles_at(parents), slots, slot)
+    particles = jnp.clip(parents, 0, line.num_particles - 1)
+    if line.order is not None:
+        particles = take(line.order, stored(particles))
+    return Ancestors(particles, slots, slot)
 
 
 def systematic(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
     shift = stored(uniform(key, dealt.targets.shape, dealt.expected.dtype))
     if dealt.kept is not None:
         shift = shift.at[dealt.kept.component].set(_own_point(dealt).fraction)
-    return _points_before(dealt.before, dealt.line.of_places(shift))
+    comes_before = dealt.line.of_places(shift) < dealt.before.fraction
+    return dealt.before.whole + comes_before.astype(jnp.int32)
 
 
 def stratified(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
@@ -124,18 +133,14 @@ def stratified(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
         own = _own_point(dealt)
         shift = shift.at[own.whole].set(own.fraction, mode="drop")
     slot = jnp.clip(dealt.before.whole, 0, shift.shape[0] - 1)
-    return _points_before(dealt.before, take(shift, slot))
+    comes_before = take(shift, slot) < dealt.before.fraction
+    return dealt.before.whole + comes_before.astype(jnp.int32)
 
 
 def _own_point(dealt: Dealt) -> Positions:
     """A point drawn uniformly from the interval of the kept particle."""
     assert dealt.kept is not None
     return dealt.kept.point(dealt.before, dealt.kept.shares[0] * dealt.expected[dealt.kept.place])
-
-
-def _points_before(before: Positions, shift: Float[Array, " #p"]) -> Int[Array, " p"]:
-    """How many of the points s + shift, one in each slot s, come before a particle's interval."""
-    return before.whole + (shift < before.fraction).astype(jnp.int32)
 
 
 def multinomial(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:

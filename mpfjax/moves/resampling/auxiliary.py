@@ -102,7 +102,7 @@ class AuxiliaryResample(AbstractMove):
         with saying("in lookahead, which is called with an observation and the particles"):
             look = getattr(look, "log_normaliser", look)
             values = look(observation, mixture.particles)
-        values = real_each(values, "lookahead: it", mixture.num_particles)
+        values = real_each(values, mixture.num_particles, "lookahead: it")
         log_factors = values.astype(mixture.log_weights.dtype)
         seen = mixture.weighed(log_factors).active
         is_seen = spread(seen, mixture.component_indicators) | ~(log_factors < jnp.inf)

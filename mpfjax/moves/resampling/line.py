@@ -28,7 +28,6 @@ from mpfjax.moves.resampling.sorting import (
 from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero, log_or_nothing
 from mpfjax.operations.prefix_sums import (
     Positions,
-    as_positions,
     exact_sum_before,
     growths,
     in_slots,
@@ -44,7 +43,7 @@ from mpfjax.operations.segments import (
     side_by_side,
     spread,
 )
-from mpfjax.operations.stored import cond_if_any, stored, take, whole
+from mpfjax.operations.stored import cond_if_any, stored, take, to_int, whole
 
 HILBERT = "hilbert"
 SortBy = Callable[[PyTree], Array] | Literal["hilbert"]
@@ -108,11 +107,6 @@ class Line(NamedTuple):
         firsts, lasts = stored(jax.vmap(least)(signed))
         return firsts, jnp.maximum(-lasts, 0)
 
-    def expected(self, targets: Int[Array, " m"]) -> Float[Array, " p"]:
-        """The expected number of offspring of each particle."""
-        shares = targets.astype(self.totals.dtype) / jnp.where(self.totals > 0, self.totals, 1.0)
-        return self.weights * self.of_places(shares)
-
     def positions(
         self, values: Float[Array, " p"], lengths: Int[Array, " m"], first_slots: Int[Array, " m"]
     ) -> tuple[Positions, Bool[Array, " p"]]:
@@ -124,18 +118,9 @@ class Line(NamedTuple):
         if needs_two_parts(values.shape[0], values.dtype):
             return _sums_in_two_parts(self, values, lengths, first_slots)
         before, total = sum_before(values)
-        return as_positions(before), before < total
-
-    def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
-        """The particles at these places."""
-        places = jnp.clip(places, 0, self.num_particles - 1)
-        return places if self.order is None else take(self.order, stored(places))
-
-    def place_of(self, particle: Int[Array, ""]) -> Int[Array, ""]:
-        """The place of a particle."""
-        if self.order is None:
-            return particle
-        return jnp.argmax(self.order == particle).astype(jnp.int32)
+        whole_parts = jnp.floor(before)
+        positions = Positions(to_int(whole_parts, len(before)), before - whole_parts)
+        return positions, before < total
 
 
 def _sums_in_two_parts(
@@ -189,9 +174,9 @@ def in_line(
     log_weights, labels = whole(mixture.log_weights, -jnp.inf), whole(labels, m)
 
     def in_order(order: Int[Array, " p"]) -> tuple[Array, Array, Array]:
-        own = take(labels, order)
+        in_turn = take(labels, order)
         # Labels without particles come last.
-        return order, jnp.where(own < m, take(log_weights, order), -jnp.inf), own
+        return order, jnp.where(in_turn < m, take(log_weights, order), -jnp.inf), in_turn
 
     def by_component() -> tuple[Array, Array, Array]:
         return in_order(order_by_segment(labels, m)[0])
@@ -270,16 +255,20 @@ def _cells(
     labels, m = mixture.component_indicators, mixture.num_components
     rows = jnp.where(mixture.occupied[None], rows, 0.0)
     weights = mixture.component_weights.astype(rows.dtype)
-    averages = lambda rows: column_sums(weights[None] * rows, labels, m)  # noqa: E731
-    # The result of a gather is stored: operations fused with it would not be vectorised.
-    own = lambda values: stored(  # noqa: E731
-        jnp.stack([spread(column, labels) for column in jnp.nan_to_num(values).T])
-    )
-    centred = rows - own(averages(rows))
+
+    def averages(rows: Float[Array, "d n"]) -> Float[Array, "m d"]:
+        return column_sums(weights[None] * rows, labels, m)
+
+    def of_particles(values: Float[Array, "m d"]) -> Float[Array, "d n"]:
+        columns = [spread(column, labels) for column in jnp.nan_to_num(values).T]
+        # The result of a gather is stored: operations fused with it would not be vectorised.
+        return stored(jnp.stack(columns))
+
+    centred = rows - of_particles(averages(rows))
     variances = averages(centred**2)
     # Particles at a single point are all in the same cell.
     is_spread = (variances > 0) & (variances < jnp.inf)
-    scales = own(jnp.where(is_spread, _STEEPNESS / jnp.sqrt(variances), 1.0))
+    scales = of_particles(jnp.where(is_spread, _STEEPNESS / jnp.sqrt(variances), 1.0))
     shares = jax.nn.sigmoid(centred * scales)
     size = float(1 << num_bits)
     return jnp.clip(jnp.nan_to_num(shares) * size, 0.0, size - 1).astype(jnp.uint32)

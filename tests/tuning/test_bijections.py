@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpfjax.tuning import Interval, Positive, Simplex
-from mpfjax.tuning.transforms import Unconstrained
+from mpfjax.tuning.bijections import Unconstrained
 
 INSIDE = {
     "positive": (Positive(), [0.01, 1.0, 300.0]),
