@@ -20,6 +20,7 @@ from mpfjax.checks import (
     to_array,
     to_numbers,
 )
+from mpfjax.models.gaussians import log_normal
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 from mpfjax.operations.random import fast_key, normal, split_once
 
@@ -276,12 +277,12 @@ class Autoregression(AbstractDynamics):
         Momentum 1 is constant velocity, 0 the random walk; Smith and Gatica-Perez (2004) have 0.5.
         `deviations` are one row for all, or a row for each particle or box, as in `RandomWalk`.
         """
-        kept = to_array("momentum")(momentum)
+        momentum = to_array("momentum")(momentum)
         deviations = RandomWalk(deviations).deviations
         d = deviations.shape[-1]
         eye = jnp.broadcast_to(jnp.eye(d, dtype=deviations.dtype), (*deviations.shape, d))
         zero = jnp.zeros_like(deviations)
-        return cls((1 + kept) * eye, -kept * eye, deviations[..., None] * eye, zero)
+        return cls((1 + momentum) * eye, -momentum * eye, deviations[..., None] * eye, zero)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -302,7 +303,7 @@ class Autoregression(AbstractDynamics):
         B = self.B[None] if self.is_shared else self.B
         factors = cholesky(jnp.sum(B[:, :, None] * B[:, None], axis=3))
         log_volume = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
-        return _log_standard_normal(solve_lower(factors, steps)) - log_volume
+        return row_sums(log_normal(solve_lower(factors, steps), 1.0)) - log_volume
 
 
 def _times(matrices: Float[Array, "*n d d"], vectors: Rows) -> Rows:
@@ -313,9 +314,4 @@ def _times(matrices: Float[Array, "*n d d"], vectors: Rows) -> Rows:
 
 
 def _log_normal(steps: Rows, deviations: Float[Array, "*n d"]) -> Float[Array, " n"]:
-    deviations = jnp.broadcast_to(deviations, steps.shape)
-    return _log_standard_normal(steps / deviations) - row_sums(jnp.log(deviations))
-
-
-def _log_standard_normal(noise: Rows) -> Float[Array, " n"]:
-    return row_sums(-0.5 * noise**2 - 0.5 * jnp.log(2 * jnp.pi))
+    return row_sums(log_normal(steps, jnp.broadcast_to(deviations, steps.shape)))

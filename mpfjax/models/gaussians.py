@@ -1,16 +1,18 @@
-"""The Kalman filter's arithmetic for many particles at once, the particles last.
+"""Gaussians: densities, and the Kalman filter's arithmetic for many particles at once.
 
-Means are (d, n), matrices (d, e, n). With the particles last, every operation runs on vectors; in
-stacks (n, d, e) nothing does, and LAPACK is called once for each. A last axis of length 1 is what
-all particles share.
+There means are (d, n), matrices (d, e, n). With the particles last, every operation runs on
+vectors; in stacks (n, d, e) nothing does, and LAPACK is called once for each. A last axis of length
+1 is what all particles share.
 """
 
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.stored import stored
 
 # The least variance, in units of the rounding error of the numbers it was computed from.
@@ -69,8 +71,8 @@ def cholesky(matrix: Float[Array, "d d #n"], floor: bool = False) -> Float[Array
     """
     factor, variances = without_correlations(matrix)
     eps, tiny = jnp.finfo(matrix.dtype).eps, jnp.finfo(matrix.dtype).tiny
-    own = jnp.stack([jnp.abs(row[j]) for j, row in enumerate(matrix)])
-    least = _ROUNDINGS * len(own) * eps * own + tiny
+    diagonal = jnp.stack([jnp.abs(row[j]) for j, row in enumerate(matrix)])
+    least = _ROUNDINGS * len(diagonal) * eps * diagonal + tiny
     # Chosen before the root, which has no derivative at zero.
     roots = jnp.sqrt(jnp.where(variances > 0, variances, least))
     return factor * (roots if floor else jnp.where(variances > 0, roots, 0.0))[None]
@@ -122,6 +124,24 @@ def without_correlations(
                 entry = entry - rows[i][k] * rows[j][k] * variances[k]
             rows[i][j] = jnp.where(is_positive, entry / jnp.where(is_positive, rest, 1.0), 0.0)
     return jnp.stack([jnp.stack(row) for row in rows]), jnp.stack(variances)
+
+
+def log_normal(
+    residuals: Float[Array, "*shape"], deviations: Float[Array, "..."] | float
+) -> Float[Array, "*shape"]:
+    """log N(r; 0, σ²) of each number."""
+    return -0.5 * (residuals / deviations) ** 2 - jnp.log(deviations) - 0.5 * jnp.log(2 * jnp.pi)
+
+
+def log_multinormal(
+    residuals: Float[Array, "n d"], covariance: Float[Array, "d d"]
+) -> Float[Array, " n"]:
+    """log N(r; 0, Σ) of each row, with one small solve whatever the number of rows."""
+    factor = jnp.linalg.cholesky(covariance)
+    identity = jnp.eye(len(factor), dtype=factor.dtype)
+    whitening = jax.scipy.linalg.solve_triangular(factor, identity, lower=True)
+    log_volume = jnp.sum(jnp.log(jnp.diagonal(factor)))
+    return row_sums(log_normal(residuals @ whitening.T, 1.0)) - log_volume
 
 
 class Gaussian(NamedTuple):

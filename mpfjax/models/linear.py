@@ -19,8 +19,9 @@ from mpfjax.checks import (
 )
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
+from mpfjax.models.gaussians import log_multinormal
 from mpfjax.operations.logarithms import log_or_nothing
-from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
+from mpfjax.operations.matrices import cholesky
 from mpfjax.operations.random import normal, uniform
 from mpfjax.operations.segments import spread
 
@@ -103,7 +104,7 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
     ) -> Float[Array, " n"]:
         """log N(y_t; H x_t, R)."""
         check_shape(f"{self.H.shape[0]}", observation=observation)
-        return _log_normal(observation[None] - self.observation_mean(states), self.R)
+        return log_multinormal(observation[None] - self.observation_mean(states), self.R)
 
     def sample_observation(
         self, key: Key[Array, ""], states: Float[Array, "n d"]
@@ -116,11 +117,11 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
         self, states: Float[Array, "n d"], previous_states: Float[Array, "n d"]
     ) -> Float[Array, " n"]:
         """log N(x_t; A x_{t-1} + B u_t, Q)."""
-        return _log_normal(states - self.transition_mean(previous_states), self.Q)
+        return log_multinormal(states - self.transition_mean(previous_states), self.Q)
 
     def log_initial(self, states: Float[Array, "n d"]) -> Float[Array, " n"]:
         """log N(x_0; m0, P0)."""
-        return _log_normal(states - self.m0[None], self.P0)
+        return log_multinormal(states - self.m0[None], self.P0)
 
     def transition_mean(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
         """A x_{t-1} + B u_t."""
@@ -274,19 +275,6 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
 def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """A lower triangular L with L Lᵀ = covariance, which may be singular."""
     is_definite = jnp.all(jnp.isfinite(jnp.linalg.cholesky(jax.lax.stop_gradient(covariance))))
-    semidefinite = lambda matrix: cholesky(matrix[None])[0]  # noqa: E731
-    return jax.lax.cond(is_definite, jnp.linalg.cholesky, semidefinite, covariance)
-
-
-def _log_normal(
-    residuals: Float[Array, "n d"], covariance: Float[Array, "d d"]
-) -> Float[Array, " n"]:
-    factor = jnp.linalg.cholesky(covariance)
-    # The columns of the factor's inverse: one small solve, whatever the number of particles.
-    whitening = solve_lower(factor[None], jnp.eye(len(factor), dtype=factor.dtype))
-    log_scale = jnp.sum(jnp.log(jnp.diagonal(factor)))
-    return (
-        -0.5 * row_sums((residuals @ whitening) ** 2)
-        - log_scale
-        - 0.5 * covariance.shape[0] * jnp.log(2 * jnp.pi)
+    return jax.lax.cond(
+        is_definite, jnp.linalg.cholesky, lambda matrix: cholesky(matrix[None])[0], covariance
     )

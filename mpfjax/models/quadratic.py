@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import POSITIVE, Finite, Fitting, to_array
 from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.gaussians import log_normal
 from mpfjax.models.noise import stratified_uniform
 from mpfjax.operations.random import normal, uniform
 
@@ -70,7 +71,7 @@ class QuadraticModel(AbstractStateSpaceModel, Fitting):
         """log N(y_t; x_t², σ_y²); raises `ValueError` for an observation that is no scalar."""
         if jnp.ndim(observation) != 0:
             raise ValueError(f"observation: shape {jnp.shape(observation)} is not that of a scalar")
-        return _log_normal(observation - states**2, self.sigma_y)
+        return log_normal(observation - states**2, self.sigma_y)
 
     def sample_observation(
         self, key: Key[Array, ""], states: Float[Array, " n"]
@@ -82,7 +83,7 @@ class QuadraticModel(AbstractStateSpaceModel, Fitting):
         self, states: Float[Array, " n"], previous_states: Float[Array, " n"]
     ) -> Float[Array, " n"]:
         """log N(x_t; x_{t-1}, σ_x²)."""
-        return _log_normal(states - previous_states, self.sigma_x)
+        return log_normal(states - previous_states, self.sigma_x)
 
     def log_initial(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
         """log p(x_0), uniform on [low, high]."""
@@ -106,7 +107,3 @@ class QuadraticModel(AbstractStateSpaceModel, Fitting):
     def observation_covariance(self) -> Float[Array, "1 1"]:
         """σ_y²."""
         return (self.sigma_y**2).reshape(1, 1)
-
-
-def _log_normal(residuals: Float[Array, " n"], sigma: Float[Array, ""]) -> Float[Array, " n"]:
-    return -0.5 * (residuals / sigma) ** 2 - jnp.log(sigma) - 0.5 * jnp.log(2 * jnp.pi)

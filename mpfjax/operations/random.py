@@ -28,19 +28,19 @@ _SHORT_ROW = 8
 _FEW = 256
 # Giles (2010), "Approximating the erfinv function", table 5, highest power first: erf⁻¹(x) / x as
 # a polynomial in w - 2.5 where w = -log(1 - x²) is below 5, and in √w - 3 beyond.
-_CENTRE = np.float32([
+_CENTRE = np.array([
     2.81022636e-08, 3.43273939e-07, -3.5233877e-06, -4.39150654e-06, 0.00021858087,
     -0.00125372503, -0.00417768164, 0.246640727, 1.50140941,
-])  # fmt: skip
-_TAIL = np.float32([
+], np.float32)  # fmt: skip
+_TAIL = np.array([
     -0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773,
     -0.0076224613, 0.00943887047, 1.00167406, 2.83297682,
-])  # fmt: skip
+], np.float32)  # fmt: skip
 # Moshier's Cephes library, logf: (log(1 + f) - f + f²/2) / f³ for 1 + f in [√½, √2].
-_LOGARITHM = np.float32([
+_LOGARITHM = np.array([
     7.0376836292e-2, -1.1514610310e-1, 1.1676998740e-1, -1.2420140846e-1, 1.4249322787e-1,
     -1.6668057665e-1, 2.0000714765e-1, -2.4999993993e-1, 3.3333331174e-1,
-])  # fmt: skip
+], np.float32)  # fmt: skip
 _ROOT_OF_HALF = 0x3F3504F3
 _FRACTION = 0x7FFFFF
 # Joe and Kuo (2008), "Constructing Sobol sequences with better two-dimensional projections", the
