@@ -96,8 +96,9 @@ def _check_differences(name: str, array: Any) -> None:
     rounding error itself, as in times between observations. Of what is in float32 already, the gaps
     between such numbers stand for what was lost.
     """
+    default = jax.dtypes.canonicalize_dtype(np.float64)
     is_wide = array.dtype.itemsize > 2 and array.dtype.kind in "iuf"
-    if isinstance(array, Tracer) or jax.dtypes.canonicalize_dtype(float) == float or not is_wide:
+    if isinstance(array, Tracer) or not is_wide or default == np.float64:
         return
     is_rounded = array.dtype == np.float32
     if np.ndim(array) == 0 or len(array) < 2 or (is_rounded and np.nanmax(np.abs(array)) < _EXACT):

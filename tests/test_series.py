@@ -8,6 +8,7 @@ import pytest
 import mpfjax
 from mpfjax import Series
 from mpfjax.models.observations import as_series
+from tests import switching
 from tests.test_inputs import INPUTS, OBSERVATIONS, Driven, mean
 from tests.user_models import ScalarLinear, TwoSensors
 
@@ -47,6 +48,37 @@ def test_what_is_missing_is_the_models_to_say():
     assert as_series(Series(seen), TwoSensors()).present is None
     mask = Series(seen, present=np.array([True, True, False]), skips_missing=True)
     np.testing.assert_array_equal(as_series(mask, TwoSensors()).present, [True, False, False])
+
+
+class Beams(ScalarLinear):
+    """Ranges; where nothing came back, a beam is infinite."""
+
+    handles_missing = True
+
+    def log_likelihood(self, observation, states):
+        hit = jnp.isfinite(observation)
+        errors = jnp.where(hit, observation, 0.0)[None] - states[:, None]
+        return -0.5 * jnp.sum(jnp.where(hit[None], errors, 0.0) ** 2, axis=1)
+
+
+class HitsAlone(Beams):
+    handles_missing = False
+
+
+def test_scans_with_infinities_are_the_models_or_are_counted(recwarn):
+    scans = np.array([[1.0, np.inf, 0.9], [np.inf] * 3, [np.nan] * 3, [1.0, 1.1, np.nan]])
+    for data in (scans[[0, 1, 1, 3]], Series.skipping(scans)):
+        run = mpfjax.run_filter(KEY, mpfjax.particle_filter(Beams(), 20), data)
+        assert (run.log_likelihood_increments[jnp.array([0, 3])] != 0).all()
+    mpfjax.particle_filter(Beams(), 20).step(KEY, run.final, scans[0])
+    assert not recwarn.list
+    refusing = mpfjax.particle_filter(HitsAlone(), 20)
+    with pytest.warns(RuntimeWarning, match="2 of 4 steps are skipped.*handles_missing"):
+        run = mpfjax.run_filter(KEY, refusing, scans, missing="skip")
+    assert (run.log_likelihood_increments == 0).all()
+    switches = mpfjax.particle_filter(switching.MODEL, 20)
+    with pytest.raises(ValueError, match="observations: infinite at index 0"):
+        mpfjax.run_filter(KEY, switches, switching.OBSERVATIONS.at[0].set(jnp.inf))
 
 
 @pytest.mark.parametrize(

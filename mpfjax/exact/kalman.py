@@ -13,7 +13,13 @@ from jaxtyping import Array, Float, PyTree
 from mpfjax.checks import as_numbers, checked
 from mpfjax.models.base import with_inputs
 from mpfjax.models.linear import LinearGaussianModel
-from mpfjax.models.observations import Series, gathered, present_steps, steps_of_inputs
+from mpfjax.models.observations import (
+    NOT_FINITE,
+    Series,
+    gathered,
+    present_steps,
+    steps_of_inputs,
+)
 
 
 class LinearStep(NamedTuple):
@@ -113,7 +119,7 @@ def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Any:
     rows = as_numbers("observations", series.observations, floating=True, in_time=True)
     if rows.ndim != 2 or rows.shape[1] != num_rows:
         raise ValueError(f"observations: shape {rows.shape} is not (t, {num_rows})")
-    present = present_steps(rows, series, takes_nan=series.skips_missing)
+    present = present_steps(rows, series, "infinite" if series.skips_missing else NOT_FINITE)
     # In numpy as far as it is known: to JAX with `jax_debug_nans` an array with a NaN is an error.
     numpy: Any = jnp if any(isinstance(each, Tracer) for each in (rows, present)) else np
     rows = numpy.asarray(rows, dtype)

@@ -10,8 +10,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree
 
-from mpfjax.checks import as_numbers, check, check_shape
+from mpfjax.checks import as_numbers, check, check_shape, warn
 from mpfjax.models.base import model_name, takes_inputs
+from mpfjax.models.conditionally_linear import is_marginalised
 
 
 class Series(eqx.Module):
@@ -35,8 +36,8 @@ class Series(eqx.Module):
     def skipping(cls, observations: PyTree, inputs: PyTree = None) -> "Series":
         """Observations of which those that hold a NaN or an infinity are missing.
 
-        A model with `handles_missing = True` gets the NaN; for it, only a step of nothing but NaN
-        is missing.
+        A model with `handles_missing = True` gets both; for it, only a step of nothing but NaN is
+        missing. For others a RuntimeWarning counts the steps of which some numbers were there.
         """
         return cls(observations, inputs, skips_missing=True)
 
@@ -55,7 +56,7 @@ def as_series(data: PyTree, model: Any, inputs: PyTree = None, missing: str = "e
     series = gathered(data, inputs, missing)
     observations = as_arrays(series.observations)
     length = _length(observations, series.observations, "observations")
-    present = present_steps(observations, series, getattr(model, "handles_missing", False))
+    present = present_steps(observations, series, refused_by(model))
     return Series(observations, steps_of_inputs(series.inputs, length, model), present)
 
 
@@ -85,7 +86,7 @@ def steps_of_inputs(
     own_length = _length(arrays, inputs, "inputs")
     if own_length != length:
         raise ValueError(f"inputs: their t is {own_length}, and that of the {of_what} is {length}")
-    return _refused_where(~_usable_steps(arrays, False), arrays, "inputs: NaN or infinite")
+    return _refused_where(~_usable_steps(arrays, NOT_FINITE), arrays, f"inputs: {NOT_FINITE}")
 
 
 def one_input(inputs: PyTree, model: Any, in_time: bool = False) -> PyTree:
@@ -119,17 +120,15 @@ class Fault(eqx.Module):
 
 def faults_of(model: Any, observation: PyTree, inputs: PyTree) -> tuple[Fault, ...]:
     """Whether y_t or u_t holds a number that the model does not take."""
-    takes_nan = getattr(model, "handles_missing", False)
-    what = "infinite" if takes_nan else "NaN or infinite"
-    faults = []
-    for tree, may_be_nan, message in (
-        (observation, takes_nan, f"observation: {what}; use predict to skip it"),
-        (inputs, False, "inputs: NaN or infinite"),
+    faults, told = [], "; use predict to skip it"
+    for name, tree, refused, hint in (
+        ("observation", observation, refused_by(model), told),
+        ("inputs", inputs, NOT_FINITE, ""),
     ):
         inexact = [leaf for leaf in jax.tree.leaves(tree) if _is_inexact(leaf)]
         if inexact:
-            usable = [jnp.all(_usable(jnp, leaf, may_be_nan)) for leaf in inexact]
-            faults.append(Fault(~jnp.all(jnp.stack(usable)), message))
+            usable = [jnp.all(_USABLE[refused](jnp, leaf)) for leaf in inexact]
+            faults.append(Fault(~jnp.all(jnp.stack(usable)), f"{name}: {refused}{hint}"))
     return tuple(faults)
 
 
@@ -148,27 +147,57 @@ def raise_faults(value: PyTree, faults: tuple[Fault, ...]) -> PyTree:
     return value
 
 
-def present_steps(observations: PyTree, series: Series, takes_nan: bool) -> Any:
-    """Which observations are there, (t,), or None where all are; raises for data not to be run."""
-    usable, present = _usable_steps(observations, takes_nan), series.present
+def present_steps(observations: PyTree, series: Series, refused: str) -> Any:
+    """Which observations are there, (t,), or None where all are; raises for data not to be run.
+
+    A warning says how many steps are skipped of which some numbers are there.
+    """
+    usable, present = _usable_steps(observations, refused), series.present
     numpy: Any = jnp if any(isinstance(mask, Tracer) for mask in (usable, present)) else np
     if present is not None:
         check_shape(f"{len(usable)}", present=present)
     present = numpy.ones(usable.shape, bool) if present is None else numpy.asarray(present, bool)
     if series.skips_missing:
         seen = usable
-        if takes_nan:
+        if refused != NOT_FINITE:
             seen = _steps_where(observations, "any", lambda numpy, leaf: ~numpy.isnan(leaf))
+        elif numpy is np:
+            _warn_of_parts(observations, present & ~usable)
         present = present & seen
-    what = "infinite" if takes_nan else "NaN or infinite"
-    hint = "" if takes_nan else "; Series.skipping(observations) takes them as missing"
-    present = _refused_where(present & ~usable, present, f"observations: {what}", hint)
+    hint = "; Series.skipping(observations) takes them as missing" * (refused == NOT_FINITE)
+    present = _refused_where(present & ~usable, present, f"observations: {refused}", hint)
     return None if numpy is np and present.all() else jnp.asarray(present)
 
 
-def _usable_steps(arrays: PyTree, takes_nan: bool) -> Any:
+def _warn_of_parts(observations: PyTree, skipped: Bool[np.ndarray, " t"]) -> None:
+    inexact = [leaf for leaf in jax.tree.leaves(observations) if _is_inexact(leaf)]
+    if inexact:
+        some = _steps_where(inexact, "any", lambda numpy, leaf: numpy.isfinite(leaf))
+        if (skipped & some).any():
+            number = f"{(skipped & some).sum()} of {len(skipped)} steps"
+            said = f"{number} are skipped for a NaN or infinity beside finite numbers"
+            warn(f"observations: {said}; a model with handles_missing = True is given them")
+
+
+# What of an observation or of inputs is refused; "" is nothing.
+NOT_FINITE = "NaN or infinite"
+_USABLE: dict[str, Callable[[Any, Any], Any]] = {
+    NOT_FINITE: lambda numpy, leaf: numpy.isfinite(leaf),
+    "infinite": lambda numpy, leaf: ~numpy.isinf(leaf),
+    "": lambda numpy, leaf: numpy.ones(leaf.shape, bool),
+}
+
+
+def refused_by(model: Any) -> str:
+    """What of an observation the model is not given: a Kalman filter takes NaN, but no infinity."""
+    if not getattr(model, "handles_missing", False):
+        return NOT_FINITE
+    return "infinite" if is_marginalised(model) else ""
+
+
+def _usable_steps(arrays: PyTree, refused: str) -> Any:
     """At which steps all numbers may be handed to the model."""
-    return _steps_where(arrays, "all", lambda numpy, leaf: _usable(numpy, leaf, takes_nan))
+    return _steps_where(arrays, "all", _USABLE[refused])
 
 
 def _steps_where(arrays: PyTree, combine: str, holds: Callable[[Any, Any], Any]) -> Any:
@@ -209,8 +238,3 @@ def _length(arrays: PyTree, tree: PyTree, name: str) -> int:
 
 def _is_inexact(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jnp.inexact)
-
-
-def _usable(numpy: Any, leaf: Any, takes_nan: bool) -> Any:
-    """Which numbers may be handed to the model."""
-    return ~numpy.isinf(leaf) if takes_nan else numpy.isfinite(leaf)
