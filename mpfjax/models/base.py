@@ -3,11 +3,11 @@ wrapper for models of one particle.
 """
 
 import abc
+import contextlib
 import copy
 import difflib
 import inspect
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -149,12 +149,18 @@ def model_name(model: Any) -> str:
     return type(_own(model)).__name__
 
 
-def asking(model: Any, method: str, given: str = "") -> AbstractContextManager[None]:
+@contextlib.contextmanager
+def asking(model: Any, method: str, given: str = "") -> Iterator[None]:
     """A block that calls a method of the model, whose errors say so, and what it was given."""
-    clauses = [f"given {given}"] if given else []
-    if getattr(model, "inputs", ()) is None and not type(model).__module__.startswith("mpfjax."):
-        clauses.append("its inputs None, as no u_t is given by inputs= or a Series")
-    return saying(f"model: {model_name(model)}.{method}", ", ".join(clauses))
+    try:
+        yield
+    except Exception:
+        clauses = [f"given {given}"] if given else []
+        is_users = not type(model).__module__.startswith("mpfjax.")
+        if getattr(model, "inputs", ()) is None and is_users:
+            clauses.append("its inputs None, as no u_t is given by inputs= or a Series")
+        with saying(f"model: {model_name(model)}.{method}", ", ".join(clauses)):
+            raise
 
 
 def _own(model: Any) -> Any:
