@@ -104,7 +104,8 @@ def _check_differences(name: str, array: Any) -> None:
     if np.ndim(array) == 0 or len(array) < 2 or (is_rounded and np.nanmax(np.abs(array)) < _EXACT):
         return
     rows = np.asarray(array, float).reshape(len(array), -1)
-    rows = np.where(np.isfinite(rows), rows, np.nan)
+    with np.errstate(over="ignore"):
+        rows = np.where(np.isfinite(rows.astype(np.float32)), rows, np.nan)
     steps = np.diff(rows, axis=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are empty, or overflow
