@@ -178,7 +178,7 @@ def make_model(targets: Targets) -> ColourModel:
 def make_filter(name: str, model: ColourModel, num_particles: int) -> mpfjax.Filter:
     """One of {one component, two} x {resample, Gaussian regeneration}."""
     redraw = mpfjax.GaussianRegeneration(where=motion) if "g" in name else mpfjax.Resample()
-    moves = [redraw, mpfjax.Propagate(model)]
+    moves = [redraw, mpfjax.Propagate()]
     if name in ("pf", "gpf"):
         return mpfjax.Filter(model, moves, num_particles)
     one_each = [

@@ -124,7 +124,7 @@ def _address(array: np.ndarray) -> ctypes.c_void_p:
 def through_parts(job: Quadratic, num_particles: int) -> dict[int, Callable[[Any], Any]]:
     """Runs of mpfjax over the keys: one that draws, one that weighs as well, and the filter."""
     model, observations = model_of(job), jnp.asarray(job.observations)
-    weighing = mpfjax.Filter(model, [mpfjax.Propagate(model)], num_particles)
+    weighing = mpfjax.Filter(model, [mpfjax.Propagate()], num_particles)
     unseen = jnp.full_like(observations, jnp.nan)
     sums = lambda mixture: jnp.sum(mixture.particles)  # noqa: E731
     moments = lambda mixture: (mixture.mean(), mixture.effective_sample_size)  # noqa: E731

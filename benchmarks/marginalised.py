@@ -111,8 +111,8 @@ def regimes(
     """Time and error of each filter and size."""
     model = manoeuvre()
     observations = simulated(model, steps)
-    every = lambda size: mpfjax.Filter(model, [mpfjax.PropagateRegimes(model)], size)  # noqa: E731
-    proposal = mpfjax.RegimeProposal(model)
+    every = lambda size: mpfjax.Filter(model, [mpfjax.PropagateRegimes()], size)  # noqa: E731
+    proposal = mpfjax.RegimeProposal()
     makes: dict[str, Callable[[int], mpfjax.Filter]] = {
         "plain": lambda size: mpfjax.particle_filter(AllDrawn(model), size),
         "marginalised": lambda size: mpfjax.particle_filter(model, size),

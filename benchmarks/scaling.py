@@ -106,7 +106,7 @@ def all_runs(cell: Cell) -> Callable[[Any], mpfjax.FilterRun]:
         filter = mpfjax.distributed_partitioned_sampling(mpfjax.MultiObjectModel(model, m), n)
         observations = jnp.broadcast_to(observations[:, None], (cell.steps, m))
     else:
-        moves = [mpfjax.Resample(), mpfjax.Propagate(model)]
+        moves = [mpfjax.Resample(), mpfjax.Propagate()]
         # Dealt at random at the start, which costs next to nothing at any T.
         filter = mpfjax.Filter(model, moves, n, m, [mpfjax.RandomPartition()])
     return lambda keys: mpfjax.monte_carlo(keys, filter, observations, nothing)
@@ -196,7 +196,7 @@ def as_tables(axis: str, entries: list[dict[str, Any]]) -> str:
 def run_as_islands(num_particles: int, repeats: int) -> dict[str, Any]:
     """One particle filter on so many particles, its islands exchanging when they have to."""
     model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
-    moves = [IslandInteraction(), mpfjax.Resample(), mpfjax.Propagate(model)]
+    moves = [IslandInteraction(), mpfjax.Resample(), mpfjax.Propagate()]
     filter = mpfjax.Filter(model, moves, num_particles // NUM_ISLANDS)
     observations = observed(ISLAND_STEPS)
 

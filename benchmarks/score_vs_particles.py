@@ -136,7 +136,7 @@ def build(
         return mpfjax.gaussian_mixture_particle_filter(
             model, num_particles, regeneration=regeneration, **mixture
         )
-    proposal = mpfjax.GaussNewtonProposal(model) if name == "guided_mpf" else None
+    proposal = mpfjax.GaussNewtonProposal() if name == "guided_mpf" else None
     filter = mpfjax.mixture_particle_filter(model, num_particles, proposal=proposal, **mixture)
     filter = mpfjax.with_resampling(filter, mpfjax.Resample(allocation="equal"))
     filter = mpfjax.with_selected_start(filter, 1)

@@ -4,7 +4,6 @@ import importlib as _importlib
 from typing import TYPE_CHECKING
 
 from mpfjax.filter import Filter as Filter
-from mpfjax.filter import StepInfo as StepInfo
 from mpfjax.filters import auxiliary_particle_filter as auxiliary_particle_filter
 from mpfjax.filters import clustered_particle_filter as clustered_particle_filter
 from mpfjax.filters import distributed_partitioned_sampling as distributed_partitioned_sampling
@@ -38,6 +37,8 @@ from mpfjax.moves.base import AbstractMove as AbstractMove
 from mpfjax.moves.base import AbstractPropagation as AbstractPropagation
 from mpfjax.moves.base import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves.base import AbstractResampling as AbstractResampling
+from mpfjax.moves.base import AbstractWrapper as AbstractWrapper
+from mpfjax.moves.base import Step as Step
 from mpfjax.moves.every import Every as Every
 from mpfjax.moves.initial import SelectInitial as SelectInitial
 from mpfjax.moves.metropolis import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
@@ -46,6 +47,9 @@ from mpfjax.moves.objects.partitioned import Partitioned as Partitioned
 from mpfjax.moves.propagation.nested import PropagateNested as PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate as Propagate
 from mpfjax.moves.propagation.propagate import PropagateMarginalised as PropagateMarginalised
+from mpfjax.moves.propagation.proposals import AbstractProposal as AbstractProposal
+from mpfjax.moves.propagation.proposals import GaussNewtonProposal as GaussNewtonProposal
+from mpfjax.moves.propagation.proposals import NetworkProposal as NetworkProposal
 from mpfjax.moves.propagation.regimes import PropagateRegimes as PropagateRegimes
 from mpfjax.moves.propagation.regimes import RegimeProposal as RegimeProposal
 from mpfjax.moves.propagation.tempered import PropagateTempered as PropagateTempered
@@ -61,9 +65,7 @@ from mpfjax.moves.resampling.gaussian import GaussianRegeneration as GaussianReg
 from mpfjax.moves.resampling.resample import Resample as Resample
 from mpfjax.operations.compiling import keep_programs as keep_programs
 from mpfjax.operations.random import normal as normal
-from mpfjax.proposals import AbstractProposal as AbstractProposal
-from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
-from mpfjax.proposals import NetworkProposal as NetworkProposal
+from mpfjax.report import StepInfo as StepInfo
 from mpfjax.running.islands import run_islands as run_islands
 from mpfjax.running.long_runs import Checkpoint as Checkpoint
 from mpfjax.running.run import monte_carlo as monte_carlo

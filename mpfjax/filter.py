@@ -1,37 +1,37 @@
 """A filter: a chain of moves on a particle mixture, one step at a time."""
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array, Bool, Key, PyTree
 
-from mpfjax.chain import (
-    INCREMENT,
-    StepInfo,
-    check_chain,
-    forgetting,
-    give_inputs,
-    moved_by,
-    normalised,
-    own_ancestors,
-    start_and_faults,
-    step_and_faults,
-    step_info,
-    tie,
-    untie,
-)
-from mpfjax.checks import Count, checked
+from mpfjax.checks import Count, checked, kinds, shown
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.base import AbstractStateSpaceModel, replaced, with_inputs
 from mpfjax.models.noise import Noise
-from mpfjax.models.observations import one_input, one_observation, raise_faults
-from mpfjax.moves.base import AbstractMove, as_moves, initial_memory
+from mpfjax.models.observations import Fault, faults_of, one_input, one_observation, raise_faults
+from mpfjax.moves.alarm import with_evidence_against
+from mpfjax.moves.base import (
+    AbstractMove,
+    AbstractPropagation,
+    AbstractPropagationOfEach,
+    Moves,
+    Step,
+    all_of,
+    as_moves,
+    memory_of,
+    name_of,
+)
 from mpfjax.moves.initial import sample_initial
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.random import split, split_keys
 from mpfjax.operations.stored import drawn_once
+from mpfjax.report import StepInfo, report_of
+
+BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
 class Filter(eqx.Module):
@@ -40,22 +40,23 @@ class Filter(eqx.Module):
     One step applies the moves in order and normalises. The growth of the total mass is the
     increment of the marginal likelihood, whatever the moves are.
 
-    - `model`: draws x_0. Moves that hold the very same model share it. The filter is then a pytree
-      with one copy of the model's parameters, and a gradient with respect to them is complete.
-    - `moves`: callables `(key, mixture, observation) -> mixture`, usually `AbstractMove`s.
+    - `model`: draws x_0, and is given to the moves, which hold none. So the filter is a pytree with
+      one copy of the model's parameters, and a gradient with respect to them is complete.
+    - `moves`: callables `(key, mixture, now) -> mixture`, usually `AbstractMove`s; `now` is a
+      `Step`.
     - `num_particles`: N.
     - `num_components`: M, the most components; recipes call it `max_components`.
     - `initial_moves`: moves of x_0, which are given y_1 where it is known: regrouping, such as
       `KMeans(reseed=True)`, and `SelectInitial`. What they weigh is part of the first increment.
     - `initial_noise`: of x_0, where the model has `initial_from_noise`: that of `Propagate`.
 
-    Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never use an observation, or
-    fewer slots than `particles_per_component` asks for.
+    Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never use an observation, a
+    model that a move cannot work with, or fewer slots than `particles_per_component` asks for.
     """
 
     model: AbstractStateSpaceModel
-    _moves: tuple[Any, ...]
-    _initial_moves: tuple[Any, ...]
+    moves: Moves
+    initial_moves: Moves
     num_particles: int = eqx.field(static=True)
     num_components: int = eqx.field(static=True)
     initial_noise: Noise = eqx.field(static=True)
@@ -67,40 +68,53 @@ class Filter(eqx.Module):
         moves: Iterable[Callable[..., ParticleMixture]],
         num_particles: Count,
         num_components: Count = 1,
-        initial_moves: Iterable[AbstractMove] = (),
+        initial_moves: Iterable[Callable[..., ParticleMixture]] = (),
         initial_noise: Noise = "independent",
     ) -> None:
-        moves = as_moves(moves, "moves")
-        check_chain(moves, num_particles, num_components)
         self.model = model
-        self._moves = tie(moves, model)
-        self._initial_moves = tie(as_moves(initial_moves, "initial_moves"), model)
+        self.moves = as_moves(moves, "moves")
+        self.initial_moves = as_moves(initial_moves, "initial_moves")
         self.num_particles, self.num_components = int(num_particles), int(num_components)
         self.initial_noise = initial_noise
 
-    @property
-    def moves(self) -> tuple[Any, ...]:
-        """The moves of one step; those that share the filter's model hold it."""
-        return untie(self._moves, self.model)
-
-    @property
-    def initial_moves(self) -> tuple[Any, ...]:
-        """The moves of x_0."""
-        return untie(self._initial_moves, self.model)
+    def __check_init__(self) -> None:
+        if self.num_particles < self.num_components:
+            which = f"is less than num_components, {self.num_components}"
+            raise ValueError(f"num_particles: {self.num_particles} {which}")
+        if not any(move.weighs for move in self.moves):
+            who = f"moves: {', '.join(map(name_of, self.moves)) or 'none'}"
+            raise ValueError(f"{who} never weigh the particles by what is observed, as Propagate")
+        now = self._now(None)
+        for move in (*self.initial_moves, *self.moves):
+            move.check(now, self.num_particles, self.num_components)
+        memory_of(self.moves, self.model, self.num_components)
+        if self._keeps_parents:
+            first = next((t for t, m in enumerate(self.moves) if _propagates(m)), 0)
+            check_keep_parents("moves", self.moves[first:], "another move")
 
     @property
     def approximate(self) -> bool:
         """Whether any move departs from the exact recursion."""
         return any(move.approximate for move in self.moves)
 
+    @property
+    def propagation(self) -> AbstractPropagationOfEach | None:
+        """The move by which x_t of one particle is drawn and weighed without a look at others."""
+        each = (move for move in self.moves if isinstance(move, AbstractPropagationOfEach))
+        return next(each, None)
+
+    @property
+    def _keeps_parents(self) -> bool:
+        return any(move.needs_parents for move in self.moves)
+
+    @property
+    def weighs_initially(self) -> bool:
+        """Whether an initial move weighs x_0, by y_1 or otherwise."""
+        return any(move.weighs for move in self.initial_moves)
+
     def replace(self, **changes: Any) -> "Filter":
-        """The filter with other arguments; moves that share its model share the new one."""
-        kept = ("num_particles", "num_components", "initial_noise")
-        own = {name: getattr(self, name) for name in kept}
-        own["model"] = model = changes.get("model", self.model)
-        own["moves"] = untie(self._moves, model)
-        own["initial_moves"] = untie(self._initial_moves, model)
-        return Filter(**own | changes)
+        """The filter with other arguments, checked anew."""
+        return dataclasses.replace(self, **changes)
 
     @checked
     def init(
@@ -114,48 +128,10 @@ class Filter(eqx.Module):
         if observation is not None:
             observation = one_observation(observation)
         inputs = one_input(inputs, self.model)
-        keys = split(key, 1 + len(self._initial_moves))
+        keys = split(key, 1 + len(self.initial_moves))
         # Not in one program with the moves, on which the last digits of the draws would depend.
         particles = drawn_once(keys[0], self._sample_initial)
         return raise_faults(*_start(self, keys, observation, inputs, particles))
-
-    def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
-        return sample_initial(key, self.model, self.num_particles, self.initial_noise)
-
-    def _init(
-        self, key: Key[Array, "*keys"], observation: PyTree = None, particles: PyTree = None
-    ) -> ParticleMixture:
-        """x_0 within a program, of these particles if they are there."""
-        key_drawn, *keys = split_keys(key, 1 + len(self._initial_moves))
-        if particles is None:
-            draw = self._sample_initial
-            particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
-        mixture = single_component(particles, self.num_components)
-        increment = {INCREMENT: jnp.zeros_like(mixture.log_scale)} if self._reads_increment else {}
-        memory = initial_memory(self.moves, self.num_components) | increment
-        mixture = mixture.replace(memory=memory)
-        for move_key, move in zip(keys, self.initial_moves, strict=True):
-            mixture = move(move_key, mixture, observation)
-        if self.looks_at_first:
-            mixture, log_mass = normalised(mixture, mixture)
-            mixture = mixture.replace(log_scale=log_mass)
-        return mixture
-
-    @property
-    def looks_at_first(self) -> bool:
-        """Whether the initial moves may weigh x_0, by y_1 or otherwise."""
-        return any(move.weighs for move in self._initial_moves)
-
-    @property
-    def _reads_increment(self) -> bool:
-        return any(INCREMENT in move.reads for move in self._moves)
-
-    def with_inputs(self, inputs: PyTree) -> "Filter":
-        """The filter at a step whose known inputs are u_t, which every model in it receives.
-
-        `step`, `predict` and the runners do this themselves. None leaves the filter as it is.
-        """
-        return give_inputs(self, self.model, inputs)
 
     def step(
         self,
@@ -179,8 +155,7 @@ class Filter(eqx.Module):
     ) -> tuple[ParticleMixture, StepInfo]:
         """One step without an observation: the particles propagate, the weights stay.
 
-        Use it for a missing y_t, or to forecast. The increment is zero. Raises `ValueError` for a
-        move without a method `predict`.
+        Use it for a missing y_t, or to forecast. The increment is zero.
         """
         return self._run(key, mixture, None, inputs)
 
@@ -188,31 +163,130 @@ class Filter(eqx.Module):
     def _run(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree, inputs: PyTree
     ) -> tuple[ParticleMixture, StepInfo]:
-        if (found := mixture.num_components) != (own := self.num_components):
-            raise ValueError(f"mixture: num_components, {found}, is not the filter's, {own}")
+        if (given := mixture.num_components) != (own := self.num_components):
+            raise ValueError(f"mixture: num_components, {given}, is not the filter's, {own}")
         inputs = one_input(inputs, self.model)
         *moved, faults = _one_step(self, key, mixture, observation, inputs)
         return raise_faults(tuple(moved), faults)
 
+    # Within a program.
+
+    def with_inputs(self, inputs: PyTree) -> "Filter":
+        """The filter at a step whose known inputs are u_t, which its model receives.
+
+        `step`, `predict` and the runners do this themselves. None leaves the filter as it is.
+        """
+        return replaced(self, model=with_inputs(self.model, inputs))
+
+    def _now(self, observation: PyTree) -> Step:
+        return Step(self.model, observation, self.propagation)
+
+    def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
+        return sample_initial(key, self.model, self.num_particles, self.initial_noise)
+
+    def _init(
+        self, key: Key[Array, "*keys"], observation: PyTree = None, particles: PyTree = None
+    ) -> ParticleMixture:
+        """x_0, of these particles if they are there."""
+        key_drawn, *keys = split_keys(key, 1 + len(self.initial_moves))
+        if particles is None:
+            draw = self._sample_initial
+            particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
+        mixture = single_component(particles, self.num_components)
+        mixture = mixture.replace(memory=memory_of(self.moves, self.model, self.num_components))
+        now = self._now(observation)
+        for move_key, move in zip(keys, self.initial_moves, strict=True):
+            mixture = move(move_key, mixture, now)
+        if self.weighs_initially:
+            mixture, log_mass = mixture.normalised(mixture)
+            mixture = mixture.replace(log_scale=log_mass, waits=log_mass != 0)
+        return mixture
+
     def _step(
         self, key: Key[Array, "*keys"], mixture: ParticleMixture, observation: PyTree = None
     ) -> tuple[ParticleMixture, StepInfo]:
-        """A step within a program; without an observation it only predicts."""
-        mixture = own_ancestors(mixture)
+        """A step; without an observation it only predicts."""
+        now, mixture = self._now(observation), mixture.with_own_ancestors()
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
-        for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
-            if self._reads_increment:
-                mixture = mixture.replace(memory=mixture.memory | {INCREMENT: increment})
-            moved, redrawn = moved_by(move, move_key, mixture, observation, self)
-            if observation is not None and not move.keeps_mass:
-                moved, log_growth = normalised(moved, mixture)
-                increment += log_growth
-            resampled |= redrawn
-            mixture = forgetting(self.moves, moved)
-        mixture = mixture.replace(parents=None, in_order=False)
-        return mixture, step_info(self.moves, mixture, observation, increment, resampled)
+        for move_key, move in zip(split_keys(key, len(self.moves)), self.moves, strict=True):
+            moved = self._moved(move, move_key, mixture, now)
+            if observation is not None:
+                resampled |= self._resampled(move, mixture, now)
+                if not move.keeps_mass:
+                    moved, log_growth = moved.normalised(mixture)
+                    increment += log_growth
+            mixture = moved
+        evidence = self._evidence_against(mixture, now, increment)
+        mixture = with_evidence_against(mixture, evidence).replace(parents=None, in_order=False)
+        return mixture, report_of(mixture, increment, resampled, evidence)
+
+    def _moved(
+        self, move: AbstractMove, key: Key[Array, ""], mixture: ParticleMixture, now: Step
+    ) -> ParticleMixture:
+        """The mixture after one move, checked."""
+        if _propagates(move) and mixture.parents is None and self._keeps_parents:
+            mixture = mixture.replace(parents=mixture.particles)
+        moved = check_result(move(key, mixture, now), mixture, move)
+        return moved.replace(in_order=False) if _propagates(move) else moved
+
+    def _resampled(
+        self, move: AbstractMove, mixture: ParticleMixture, now: Step
+    ) -> Bool[Array, " m"]:
+        """Which components of the mixture that move would resample."""
+        due = move.would_resample(mixture, now)
+        return due if mixture.waits is None else due & ~mixture.waits
+
+    def _evidence_against(self, mixture: ParticleMixture, now: Step, increment: Array) -> Any:
+        told = (move.evidence_against(mixture, now, increment) for move in self.moves)
+        return next((each for each in told if each is not None), None)
+
+    def _step_and_faults(
+        self,
+        key: Key[Array, "*keys"],
+        mixture: ParticleMixture,
+        observation: PyTree,
+        inputs: PyTree = None,
+    ) -> tuple[ParticleMixture, StepInfo, tuple[Fault, ...]]:
+        """A step, and what `raise_faults` needs when the program has ended."""
+        faults = faults_of(self.model, observation, inputs)
+        moved, info = self.with_inputs(inputs)._step(key, mixture, observation)
+        broken = Fault(~(info.log_likelihood_increment < jnp.inf), BROKEN_DENSITY)
+        return moved, info, (*faults, broken)
+
+    def _start_and_faults(
+        self, keys: Key[Array, " keys"], observation: PyTree, inputs: PyTree, particles: PyTree
+    ) -> tuple[ParticleMixture, tuple[Fault, ...]]:
+        """The same for the mixture of x_0, of these particles."""
+        faults = faults_of(self.model, observation, inputs)
+        return self.with_inputs(inputs)._init(keys, observation, particles), faults
 
 
-_one_step = jit_with_floats_traced(step_and_faults)
-_start = jit_with_floats_traced(start_and_faults)
+_one_step = jit_with_floats_traced(Filter._step_and_faults)
+_start = jit_with_floats_traced(Filter._start_and_faults)
+
+
+def _propagates(move: AbstractMove) -> bool:
+    return isinstance(move, AbstractPropagation)
+
+
+def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: str) -> None:
+    """Raise a `ValueError` that names a move after which particles have no single parents."""
+    for move in all_of(moves):
+        if not move.keeps_parents:
+            which = f"one parent x_(t-1), which {needed_by} needs"
+            raise ValueError(f"{argument}: {name_of(move)} leaves no particle {which}")
+
+
+def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> ParticleMixture:
+    """The result of a move; a `ValueError` unless it is a mixture of the same shapes and types."""
+    who = f"moves: {name_of(move)} returned"
+    if not isinstance(moved, ParticleMixture):
+        raise ValueError(f"{who} {shown(moved)}, no ParticleMixture")
+    given, returned = (
+        kinds((each.particles, each.log_weights, each.component_indicators))
+        for each in (mixture, moved)
+    )
+    if returned != given:
+        raise ValueError(f"{who} {returned}, and was given {given}")
+    return moved

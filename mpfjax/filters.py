@@ -20,6 +20,7 @@ from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, Reassembly
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
+from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.moves.regrouping.features import OnCircles, Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
 from mpfjax.moves.regrouping.merge import Merge
@@ -28,7 +29,6 @@ from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration
 from mpfjax.moves.resampling.line import SortBy
 from mpfjax.moves.resampling.resample import Resample, Scheme
-from mpfjax.proposals import AbstractProposal
 from mpfjax.transforms import (
     with_lookahead,
     with_point_sets,
@@ -59,7 +59,7 @@ def particle_filter(
     it for a filtering distribution with one mode. If there are several, it loses all but one.
     `noise="rqmc"` is `with_point_sets`, and `gradient="stop"`, for tuning, `with_score_gradient`.
     """
-    moves = [Resample(scheme, ess_threshold, sort_by=sort_by), Propagate(model, proposal)]
+    moves = [Resample(scheme, ess_threshold, sort_by=sort_by), Propagate(proposal)]
     return _with(noise, gradient, Filter(model, moves, num_particles))
 
 
@@ -78,7 +78,7 @@ def auxiliary_particle_filter(
 
     Pitt and Shephard (1999). `lookahead` is a function (y_t, states) -> log ν of each particle, or
     a proposal with `log_normaliser`, which then also draws x_t unless another `proposal` is given.
-    Ẑ is unbiased for any look-ahead; see `AuxiliaryResample`. With `GaussNewtonProposal(model, 1,
+    Ẑ is unbiased for any look-ahead; see `AuxiliaryResample`. With `GaussNewtonProposal(1,
     inflation=1.0)` for a `LinearGaussianModel` the filter is fully adapted: ν is p(y_t | x_{t-1}),
     x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are equal. Use it where the likelihood
     is narrow and y_t shows early which particles will survive.
@@ -159,10 +159,10 @@ def gaussian_particle_filter(
     refuse_marginalised(model, "gaussian_particle_filter")
     redraw = GaussianRegeneration() if regeneration is None else regeneration
     if importance == "propagated":
-        return Filter(model, [redraw, Propagate(model, proposal)], num_particles)
+        return Filter(model, [redraw, Propagate(proposal)], num_particles)
     if proposal is not None:
         raise ValueError(f"importance: {importance!r} draws from no proposal, but one was given")
-    return Filter(model, [redraw, Predict(model), redraw, Reweight(model)], num_particles)
+    return Filter(model, [redraw, Predict(), redraw, Reweight()], num_particles)
 
 
 @checked
@@ -219,7 +219,7 @@ def partitioned_sampling(
     `scheme` and `ess_threshold` are those of the resampling between steps and objects.
     """
     between = Resample(scheme, ess_threshold, allocation="equal")
-    moves = [Resample(scheme, ess_threshold), Partitioned(model, order, resample=between)]
+    moves = [Resample(scheme, ess_threshold), Partitioned(order, resample=between)]
     return Filter(model, moves, num_particles)
 
 
@@ -246,14 +246,13 @@ def distributed_partitioned_sampling(
     """
     orders = "circular" if orders is None else orders
     between = Resample(scheme, ess_threshold, allocation="equal")
-    partitioned = Partitioned(model, orders, resample=between, reassembly=reassembly)
-    of_sets = partitioned.orders
+    partitioned = Partitioned(orders, resample=between, reassembly=reassembly)
     resample = Resample(scheme, ess_threshold)
     return Filter(
         model,
         moves=[Pool(), resample, RandomPartition(), partitioned],
         num_particles=num_particles,
-        num_components=model.num_objects if of_sets is None else len(of_sets),
+        num_components=model.num_objects if isinstance(orders, str) else len(partitioned.orders),
     )
 
 
@@ -268,7 +267,9 @@ def independent_particle_filters(
     that cross may end on the same object. Estimates are after resampling; see
     `PropagateIndependently`.
     """
-    return Filter(model, [PropagateIndependently(model, scheme=scheme)], num_particles)
+    ignores = model.interaction is not None
+    move = PropagateIndependently(scheme=scheme, ignores_interaction=ignores)
+    return Filter(model, [move], num_particles)
 
 
 @checked
@@ -295,7 +296,7 @@ def clustered_particle_filter(
     are after resampling. A cluster's distribution may have several modes, such as two look-alikes
     in either order. Their mean is then a place where no object is: take a median.
     """
-    move = PropagateInClusters(model, start, split_after, scheme=scheme)
+    move = PropagateInClusters(start, split_after, scheme=scheme)
     return Filter(model, moves=[move], num_particles=num_particles)
 
 

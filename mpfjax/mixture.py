@@ -1,5 +1,6 @@
 """The particle mixture: one set of joint weights, and all that is derived from it."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, NamedTuple
 
@@ -9,13 +10,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int, PyTree, Shaped
 
 from mpfjax.checks import SHARES, as_numbers, checked, saying
+from mpfjax.operations.islands import excess_over_islands, island_index, num_islands
 from mpfjax.operations.logarithms import (
     as_inexact,
     default_float,
     exp,
     finite_max,
+    finite_or_zero,
     log_sum_exp,
     scaled_exp,
+    scaled_log_sum_exp,
     softmax,
 )
 from mpfjax.operations.prefix_sums import sum_before
@@ -72,6 +76,9 @@ class ParticleMixture(eqx.Module):
     - `log_scale`: the logarithm of a common factor of all weights. It is kept apart from ℓ, which
       would lose its digits if a log-likelihood of a million were added. After a step it is zero.
       In a mixture of x_0 it is what the initial moves leave to the first increment.
+    - `waits`: whether x_0 was chosen by the first observation and weighs the inverse, so that no
+      resampling is due before that observation has weighed x_1 too: it would undo the choice. None
+      where no initial move weighs.
 
     The properties are those of one mixture. For a stack of mixtures, as `monte_carlo` and
     `collect=None` return, they raise a `ValueError` that says to `jax.vmap` over the leading axes.
@@ -87,6 +94,7 @@ class ParticleMixture(eqx.Module):
     log_scale: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), default_float()))
     parents: PyTree = None
     in_order: bool = eqx.field(static=True, default=False)
+    waits: Bool[Array, ""] | None = None
 
     @property
     def num_particles(self) -> int:
@@ -295,6 +303,62 @@ class ParticleMixture(eqx.Module):
             log_scale = log_scale + common
         log_weights = jnp.where(self.occupied, log_weights, -jnp.inf)
         return self.replace(log_weights=log_weights, log_scale=log_scale)
+
+    def normalised(self, previous: "ParticleMixture") -> tuple["ParticleMixture", Float[Array, ""]]:
+        """The mixture with a mass of one over all islands, and the logarithm of what it was.
+
+        If no mass is left, the weights are those of `previous`.
+        """
+        # The scale is removed first, which is exact. If it were added to the logarithm of the sum,
+        # that would be lost to rounding.
+        log_sum, log_largest = scaled_log_sum_exp(self.log_weights)
+        log_excess, log_total, log_scale = excess_over_islands(self.log_scale, log_largest, log_sum)
+        has_mass = log_total > -jnp.inf
+        log_share = log_excess - jnp.where(has_mass, log_total, 0.0)
+        shares = (self.log_weights - log_largest) + log_share
+        # A comparison with NaN is false, but NaN is not a step of zero likelihood.
+        keep = has_mass | jnp.isnan(log_total)
+        log_weights = jnp.where(keep, shares, previous.log_weights)
+        waits = None if self.waits is None else jnp.zeros_like(self.waits)
+        normal = self.replace(
+            log_weights=log_weights, log_scale=jnp.zeros_like(log_total), waits=waits
+        )
+        return normal, log_scale + log_total
+
+    def joined(self, other: "ParticleMixture") -> "ParticleMixture":
+        """The mixture with the usable particles of another one in the slots after its own.
+
+        Both bring their mass, `other` that of one island for the share of each: whatever their
+        scales are, the masses add up. `usable_slots` says how many slots belong to each, of which
+        the mixture must have enough; those of both are usable then. Memory is the mixture's.
+        """
+        first = jnp.asarray(self.num_usable_slots, jnp.int32)
+        number = jnp.asarray(other.num_usable_slots, jnp.int32)
+        place = jnp.arange(self.num_particles, dtype=jnp.int32) - first
+        is_new = (place >= 0) & (place < number)
+        rank = jnp.clip(place, 0, other.num_particles - 1)
+        log_scale = jnp.maximum(self.log_scale, other.log_scale)
+        # One of them may be without any mass.
+        log_scale = finite_or_zero(log_scale)
+        log_share = (other.log_scale - log_scale) - math.log(num_islands())
+        brought = other.replace(log_weights=other.log_weights + log_share).at(rank)
+        own = self.replace(log_weights=self.log_weights + (self.log_scale - log_scale))
+
+        def pick(new: Array, old: Array) -> Array:
+            return jnp.where(_rows(is_new, new), new, old)
+
+        slots = {
+            name: jax.tree.map(pick, getattr(brought, name), getattr(own, name))
+            for name in _OF_SLOTS
+        }
+        return own.replace(**slots, log_scale=log_scale, usable_slots=first + number)
+
+    def with_own_ancestors(self) -> "ParticleMixture":
+        """The mixture whose particles are their own ancestors, as before a step."""
+        own = jnp.arange(self.num_particles, dtype=jnp.int32)
+        if num_islands() > 1:
+            own += self.num_particles * island_index()
+        return self.replace(ancestor_indices=own)
 
     def at(self, slots: Int[Array, " k"]) -> "ParticleMixture":
         """The particles of these slots, with all that belongs to them.

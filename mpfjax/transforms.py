@@ -4,35 +4,54 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-import jax
-
 from mpfjax.checks import Count, InnerShare, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead, PilotLookahead
-from mpfjax.moves.base import AbstractMove
-from mpfjax.moves.initial import SelectInitial, sample_initial
+from mpfjax.moves.base import (
+    AbstractMove,
+    AbstractPropagation,
+    AbstractPropagationOfEach,
+    AbstractRegrouping,
+)
+from mpfjax.moves.initial import SelectInitial, require_propagation
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
+from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.moves.restarts import RegroupOthers, Restart, WatchStart
-from mpfjax.proposals import AbstractProposal
+from mpfjax.moves.restarts import RegroupOthers, Restart, WatchStart, plain_resample
 
 
 @checked
 def map_moves(change: Callable[[Any], Any], filter: Filter) -> Filter:
     """The filter with `change(move)` in the place of each move.
 
-    It reaches the moves that others run for the chain first, as those of an `Every`:
+    It reaches the moves that others hold first, as those of an `Every`, and the resampling within a
+    `Partitioned`:
 
         map_moves(lambda m: Resample("ssp") if isinstance(m, Resample) else m, filter)
     """
-    changed = lambda move: change(move.map_inner(changed))  # noqa: E731
+    return _changed(change, filter, lambda move: True)
+
+
+def _changed(
+    change: Callable[[Any], Any], filter: Filter, enters: Callable[[AbstractMove], bool]
+) -> Filter:
+    """The filter with its moves changed, and before them those held by moves that it enters."""
+
+    def changed(move: AbstractMove) -> Any:
+        return change(move.map_inner(changed) if enters(move) else move)
+
     return filter.replace(
         moves=[changed(move) for move in filter.moves],
         initial_moves=[changed(move) for move in filter.initial_moves],
     )
+
+
+def _map_chain(change: Callable[[Any], Any], filter: Filter) -> Filter:
+    """The same of the chain's own moves alone, not of those that propagations hold."""
+    return _changed(change, filter, lambda move: not isinstance(move, AbstractPropagation))
 
 
 @checked
@@ -42,7 +61,7 @@ def with_resampling(filter: Filter, resample: Resample) -> Filter:
     Raises `ValueError` for anything but a `Resample`. Use it for other slots of components:
     `with_resampling(filter, Resample(allocation="equal"))`.
     """
-    return map_moves(lambda move: resample if isinstance(move, Resample) else move, filter)
+    return _map_chain(lambda move: resample if isinstance(move, Resample) else move, filter)
 
 
 @checked
@@ -60,7 +79,8 @@ def with_point_sets(filter: Filter) -> Filter:
             return dataclasses.replace(move, sort_by=HILBERT)
         return move
 
-    return _everywhere(map_moves(in_order, filter), "noise", "rqmc").replace(initial_noise="rqmc")
+    ordered = _map_chain(in_order, filter)
+    return _everywhere(ordered, "noise", "rqmc").replace(initial_noise="rqmc")
 
 
 @checked
@@ -81,15 +101,15 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
     for a filter without `Propagate`. Use it where the likelihood is narrow and cheap, with four to
     sixteen draws.
     """
-    _propagation_of(filter, "each particle draws")
+    require_propagation(filter._now(None), "each particle draws")
 
     def nested(move: Any) -> Any:
-        if not move.draws_each:
+        if not isinstance(move, AbstractPropagationOfEach):
             return move
         plain = move.propagate if isinstance(move, PropagateNested) else move
         return plain if num_draws == 1 else PropagateNested(plain, num_draws)
 
-    return map_moves(nested, filter)
+    return _map_chain(nested, filter)
 
 
 @checked
@@ -100,9 +120,9 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
     that is a proposal also draws x_t, where the filter has no other. Raises `ValueError` for a
     filter without `Resample`.
     """
-    plain = map_moves(lambda m: m.resample if isinstance(m, AuxiliaryResample) else m, filter)
-    look = PilotLookahead(filter.model) if lookahead is None else lookahead
-    if not any(isinstance(move, Resample) for move in plain.moves):
+    plain = _map_chain(lambda m: m.resample if isinstance(m, AuxiliaryResample) else m, filter)
+    look = PilotLookahead() if lookahead is None else lookahead
+    if not any(map(plain_resample, plain.moves)):
         raise ValueError("filter: none of its moves is a Resample, which could look ahead")
 
     def ahead(move: Any) -> Any:
@@ -113,7 +133,7 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
             return dataclasses.replace(move, proposal=look)
         return move
 
-    return map_moves(ahead, plain)
+    return _map_chain(ahead, plain)
 
 
 @checked
@@ -128,8 +148,7 @@ def with_selected_start(filter: Filter, num_draws: Count | None = None) -> Filte
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
     if num_draws == 1:
         return filter.replace(initial_moves=others)
-    look = _propagation_of(filter, "x_0 is chosen")
-    select = SelectInitial(look, num_draws, filter.initial_noise)
+    select = SelectInitial(num_draws, filter.initial_noise)
     return filter.replace(initial_moves=[select, *others])
 
 
@@ -147,15 +166,24 @@ def with_restarts(
     `ValueError` for a filter that does not resample all components at each step by a `Resample`.
     Use it where a hypothesis may be wrong for good: a robot that is carried away, a lost target.
     """
-    propagation = _propagation_of(filter, "a state begins anew")
-    if not any(move.resampling is not None for move in filter.moves):
+    if not any(map(plain_resample, filter.moves)):
         raise ValueError("filter: none of its moves is a Resample, with which a state begins anew")
-    apart = map_moves(lambda move: RegroupOthers(move) if move.regroups else move, filter)
-    moves = [
-        Restart(move, propagation, probability, share, num_draws) if move.resampling else move
-        for move in apart.moves
-    ]
-    return apart.replace(moves=moves, num_components=filter.num_components + 1)
+
+    def restarting(move: Any) -> Any:
+        return Restart(move, probability, share, num_draws) if plain_resample(move) else move
+
+    return filter.replace(
+        moves=[restarting(_apart(move)) for move in filter.moves],
+        initial_moves=[_apart(move) for move in filter.initial_moves],
+        num_components=filter.num_components + 1,
+    )
+
+
+def _apart(move: Any) -> Any:
+    """The move with its regroupings kept from the component of restarts."""
+    if isinstance(move, AbstractRegrouping):
+        return RegroupOthers(move)
+    return move.map_inner(_apart)
 
 
 @checked
@@ -166,39 +194,15 @@ def with_alarm(filter: Filter, num_draws: Count = 4096) -> Filter:
     x_0, made once, which cost as much as so many particles of a plain filter. `with_restarts` has
     the same evidence from its own draws. Use it where a lost target must be noticed.
     """
-    propagation = _propagation_of(filter, "draws of x_0 are compared")
-    draws = sample_initial(jax.random.key(0), filter.model, num_draws)
-    return filter.replace(moves=[*filter.moves, WatchStart(propagation, draws)])
-
-
-def _propagation_of(filter: Filter, what: str) -> Any:
-    """The move that draws x_t one particle at a time; a `ValueError` where there is none."""
-    found = [move for move in filter.moves if move.draws_each]
-    if not found:
-        raise ValueError(
-            f"filter: {what} where Propagate or PropagateNested propagates, and none of its moves"
-            " is one"
-        )
-    return found[0]
+    return filter.replace(moves=[*filter.moves, WatchStart(num_draws)])
 
 
 def _everywhere(filter: Filter, field: str, value: str) -> Filter:
     """The filter with another value of a field in all moves that have it, also within others."""
 
-    def has_it(node: Any) -> bool:
-        return isinstance(node, AbstractMove) and field in node.__dataclass_fields__
-
     def replaced(node: Any) -> Any:
-        if not has_it(node):
+        if not isinstance(node, AbstractMove) or field not in node.__dataclass_fields__:
             return node
-        own = {name: visit(getattr(node, name)) for name in node.__dataclass_fields__}
-        return type(node)(**own | {field: value})
+        return dataclasses.replace(node, **{field: value})
 
-    def visit(tree: Any) -> Any:
-        # The model stays the very same object, by which a filter knows its own.
-        return jax.tree.map(replaced, tree, is_leaf=lambda n: n is filter.model or has_it(n))
-
-    return filter.replace(
-        moves=[visit(move) for move in filter.moves],
-        initial_moves=[visit(move) for move in filter.initial_moves],
-    )
+    return map_moves(replaced, filter)

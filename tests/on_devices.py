@@ -48,7 +48,7 @@ def islands_filter(num_particles=32):
     """A mixture whose islands exchange particles whenever their masses differ at all."""
     model = quadratic()
     moves = [
-        IslandInteraction(1.0), mpfjax.Resample(), mpfjax.Propagate(model), mpfjax.KMeans(2),
+        IslandInteraction(1.0), mpfjax.Resample(), mpfjax.Propagate(), mpfjax.KMeans(2),
     ]  # fmt: skip
     return mpfjax.Filter(model, moves, num_particles, 2, [mpfjax.KMeans(2, reseed=True)])
 

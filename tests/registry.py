@@ -101,7 +101,7 @@ def _chain(
 ) -> Callable[..., Filter]:
     return lambda model: Filter(
         model,
-        [*before, Propagate(model, proposal(model)), *then],
+        [*before, Propagate(proposal(model)), *then],
         NUM_PARTICLES,
         m,
         initial_moves=[KMeans(3, reseed=True)],
@@ -113,13 +113,13 @@ def _metropolis(m: int) -> Callable[..., Filter]:
 
     def make(model):
         moves = [
-            Predict(model),
-            Reweight(model, 0.3),
+            Predict(),
+            Reweight(0.3),
             Resample("stratified"),
-            RandomWalkMetropolis(model, 2, exponent=0.3),
-            Reweight(model, 0.7),
+            RandomWalkMetropolis(2, exponent=0.3),
+            Reweight(0.7),
             Resample(ess_threshold=0.9),
-            MetropolisAdjustedLangevin(model),
+            MetropolisAdjustedLangevin(),
             KMeans(2),
         ]
         initial = [KMeans(3, reseed=True)] if m > 1 else []
@@ -154,12 +154,12 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         "mpf": _mpf(m),
         "mpf rqmc": _mpf(m, noise="rqmc"),
         "guided mpf rqmc, adaptive": lambda model: _mpf(
-            m, proposal=GaussNewtonProposal(model), noise="rqmc", ess_threshold=0.5
+            m, proposal=GaussNewtonProposal(), noise="rqmc", ess_threshold=0.5
         )(model),
         "gaussian mixture rqmc": lambda model: mpfjax.with_point_sets(
             mpfjax.gaussian_mixture_particle_filter(model, NUM_PARTICLES, m)
         ),
-        "guided mpf": lambda model: _mpf(m, proposal=GaussNewtonProposal(model))(model),
+        "guided mpf": lambda model: _mpf(m, proposal=GaussNewtonProposal())(model),
         "guided, sorted": _chain(
             Resample(sort_by=lambda states: states.reshape(NUM_PARTICLES, -1)[:, 0]),
             m=m,
@@ -178,7 +178,7 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         "partitioned in clusters": _joint(
             lambda joint: Filter(
                 joint,
-                [Resample(), KMeans(), Partitioned(joint, "circular")],
+                [Resample(), KMeans(), Partitioned("circular")],
                 NUM_PARTICLES,
                 m,
                 initial_moves=[KMeans(3, reseed=True)],
@@ -199,10 +199,10 @@ CHAINS: dict[str, Callable[..., Filter]] = {
         mpfjax.with_selected_start(_pf(noise="rqmc")(model), 3), 2
     ),
     "auxiliary pf, adaptive": lambda model: mpfjax.auxiliary_particle_filter(
-        model, NUM_PARTICLES, GaussNewtonProposal(model), ess_threshold=0.5
+        model, NUM_PARTICLES, GaussNewtonProposal(), ess_threshold=0.5
     ),
     "auxiliary mpf": lambda model: mpfjax.with_lookahead(_mpf()(model), Halfway(model)),
-    "guided pf": lambda model: _pf(proposal=GaussNewtonProposal(model))(model),
+    "guided pf": lambda model: _pf(proposal=GaussNewtonProposal())(model),
     **_of_components(NUM_COMPONENTS),
     **{
         f"{name}, M = {MANY_COMPONENTS}": chain
@@ -212,22 +212,22 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "metropolis": _metropolis(1),
     "mixture with metropolis": _metropolis(NUM_COMPONENTS),
     "every second step a random walk": lambda model: _chain(
-        Resample(), then=[Every(2, [RandomWalkMetropolis(model)])]
+        Resample(), then=[Every(2, [RandomWalkMetropolis()])]
     )(model),
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
     "guided mpf rqmc of families": lambda model: mpfjax.with_proposals_per_particle(
-        _mpf(proposal=GaussNewtonProposal(model), noise="rqmc")(model), 3
+        _mpf(proposal=GaussNewtonProposal(), noise="rqmc")(model), 3
     ),
     "in stages": lambda model: Filter(
         model,
-        [Resample(), PropagateTempered(model, exponents=(0.1, 0.4, 1.0)), KMeans()],
+        [Resample(), PropagateTempered(exponents=(0.1, 0.4, 1.0)), KMeans()],
         NUM_PARTICLES,
         NUM_COMPONENTS,
         initial_moves=[KMeans(3, reseed=True)],
         initial_noise="rqmc",
     ),
     "predict and weigh": lambda model: Filter(
-        model, [Resample(), Predict(model), Reweight(model)], NUM_PARTICLES
+        model, [Resample(), Predict(), Reweight()], NUM_PARTICLES
     ),
     "joint pf": _joint(_pf()),
     "ps adaptive, random order": _joint(

@@ -131,7 +131,7 @@ class Cliff(mpfjax.QuadraticModel):
 def exchanging(model):
     """A mixture on islands that exchange particles last but for K-means."""
     exchange = IslandInteraction(0.9)
-    moves = [mpfjax.Resample(), mpfjax.Propagate(model), exchange, mpfjax.KMeans(2)]
+    moves = [mpfjax.Resample(), mpfjax.Propagate(), exchange, mpfjax.KMeans(2)]
     return mpfjax.Filter(model, moves, 12, 2, [mpfjax.KMeans(2, reseed=True)])
 
 
@@ -159,7 +159,7 @@ class TestIslands:
 
         model = Cliff(0.3, 0.5, -2.0, 2.0)
         for exchange in (IslandInteraction(0.0), IslandInteraction(1.0)):
-            moves = [mpfjax.Resample(), mpfjax.Propagate(model), exchange]
+            moves = [mpfjax.Resample(), mpfjax.Propagate(), exchange]
             run = mpfjax.run_islands(
                 jax.random.key(6),
                 mpfjax.Filter(model, moves, 8),
@@ -194,7 +194,7 @@ class TestIslands:
             np.testing.assert_allclose(with_it.log_likelihood_increments, increments, rtol=1e-6)
 
     def test_slots_that_cannot_be_dealt_evenly(self):
-        filter = mpfjax.Filter(MODEL, [IslandInteraction(), mpfjax.Propagate(MODEL)], 13)
+        filter = mpfjax.Filter(MODEL, [IslandInteraction(), mpfjax.Propagate()], 13)
         with pytest.raises(ValueError, match=r"num_particles: 13 of an island.* 2 islands"):
             mpfjax.run_islands(jax.random.key(0), filter, OBSERVATIONS, num_islands=2)
 

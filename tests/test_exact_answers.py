@@ -25,7 +25,7 @@ STATES = np.linspace(-2.0, 2.0, 24)
 NORMAL = scipy.stats.norm.logpdf
 
 
-GUIDED = Propagate(MODEL, GaussNewtonProposal(MODEL, 1, inflation=1.0))
+GUIDED = Propagate(GaussNewtonProposal(1, inflation=1.0))
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_prior_masses_of_dps_are_those_of_the_living_and_the_total_is_the_eviden
         before = before.replace(log_weights=jnp.asarray(log_weights, jnp.float32))
     model = MultiObjectModel(ScalarLinear(), 2, shared_observation=True)
     prior, evidence = (
-        eqx.filter_jit(Partitioned(model, reassembly=name))(jax.random.key(0), before, 0.5)
+        eqx.filter_jit(Partitioned(reassembly=name))(jax.random.key(0), before, 0.5)
         for name in ("prior", "evidence")
     )
     shares = np.exp(np.asarray(before.log_mixture_weights, float))
@@ -110,7 +110,7 @@ def test_slots_are_asked_for_by_mass_times_the_root_of_the_variance():
 
 def test_the_total_of_islands_is_the_mean_over_all_their_particles():
     """Of one step without resampling, from the likelihoods of the particles themselves."""
-    filter = mpfjax.Filter(MODEL, [Propagate(MODEL)], 12)
+    filter = mpfjax.Filter(MODEL, [Propagate()], 12)
     run = mpfjax.run_islands(jax.random.key(0), filter, jnp.array([0.7]), num_islands=4)
     log_likelihoods = NORMAL(0.7, np.asarray(run.final.particles, float), 0.5)
     expected = np.logaddexp.reduce(log_likelihoods) - np.log(48)

@@ -72,7 +72,7 @@ def test_three_methods_are_enough_for_any_pytree_of_states_and_observations():
         def log_likelihood(self, observation, states):
             return jnp.where(observation["seen"], -0.5 * (observation["y"] - states["x"]) ** 2, 0.0)
 
-    filter = Filter(Minimal(), [Resample(), Propagate(Minimal())], 30, 3)
+    filter = Filter(Minimal(), [Resample(), Propagate()], 30, 3)
     seen = {"y": OBSERVATIONS, "seen": jnp.array([True, False, True, True])}
     run = mpfjax.run_filter(KEY, filter, seen, mean)
     assert run.collected["x"].shape == (4,)
@@ -84,7 +84,7 @@ def test_a_move_may_be_any_function():
     def temper(key, mixture, observation):
         return mixture.replace(log_weights=mixture.log_weights - 0.5)
 
-    plain = Filter(QUADRATIC, [Resample(), Propagate(QUADRATIC)], 48)
+    plain = Filter(QUADRATIC, [Resample(), Propagate()], 48)
     custom = plain.replace(moves=[*plain.moves, temper])
     assert custom.approximate
     ours, theirs = (mpfjax.run_filter(KEY, f, OBSERVATIONS) for f in (custom, plain))
@@ -100,7 +100,7 @@ def test_the_mass_of_a_mixture_given_by_hand_counts_once_whatever_moves_leave_th
     def learns(key, mixture, observation):
         return mixture
 
-    for moves in ([Propagate(QUADRATIC), learns, Resample()], [learns, Propagate(QUADRATIC)]):
+    for moves in ([Propagate(), learns, Resample()], [learns, Propagate()]):
         filter = Filter(QUADRATIC, moves, 50)
         given = filter.init(KEY)
         heavier = given.replace(log_weights=given.log_weights + 3)

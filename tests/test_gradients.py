@@ -31,7 +31,7 @@ def single(make, *sizes, **options):
 
 
 def guided(model):
-    proposal = mpfjax.GaussNewtonProposal(model)
+    proposal = mpfjax.GaussNewtonProposal()
     return mpfjax.particle_filter(model, NUM_PARTICLES, proposal=proposal)
 
 
@@ -45,7 +45,7 @@ def resample(model):
 
 def pathwise(model):
     """Stop-gradient resampling of particles that are differentiated through their draws."""
-    return Filter(model, [Resample(gradient="stop"), Propagate(model)], NUM_PARTICLES)
+    return Filter(model, [Resample(gradient="stop"), Propagate()], NUM_PARTICLES)
 
 
 WITH_GAP = ONE.at[1].set(jnp.nan)
@@ -111,9 +111,9 @@ def test_plain_derivatives_are_biased():
 
 MOVES = {
     "resampling": lambda gradient: Resample(ess_threshold=0.5, gradient=gradient),
-    "bootstrap": lambda gradient: Propagate(MODEL, None, gradient),
-    "guided": lambda gradient: Propagate(MODEL, mpfjax.GaussNewtonProposal(MODEL), gradient),
-    "halves": lambda gradient: Predict(MODEL, gradient=gradient),
+    "bootstrap": lambda gradient: Propagate(None, gradient),
+    "guided": lambda gradient: Propagate(mpfjax.GaussNewtonProposal(), gradient),
+    "halves": lambda gradient: Predict(gradient=gradient),
 }
 
 
@@ -143,7 +143,7 @@ def test_gradients_are_finite_where_weights_and_components_vanish():
     observations = jnp.array([1.5, 1.0, BLINDED, 0.4, 0.9])
 
     def log_evidence(model):
-        moves = [Resample("systematic", 0.7, 4, gradient="stop"), Propagate(model, None, "stop"),
+        moves = [Resample("systematic", 0.7, 4, gradient="stop"), Propagate(None, "stop"),
                  mpfjax.Merge(2.0, 1.0, patience=2)]  # fmt: skip
         filter = Filter(model, moves, 24, 6, initial_moves=[mpfjax.RandomPartition()])
         run = mpfjax.run_filter(jax.random.key(6), filter, observations)

@@ -158,7 +158,7 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
         return mixture.weighed(log_factors)
 
     model, observation = ScalarLinear(a=1.0, q=0.3, r=0.3, m=0.0, p=3.0), 1.5
-    propagate = mpfjax.Propagate(model)
+    propagate = mpfjax.Propagate()
     filter = mpfjax.Filter(
         model, [tilt, mpfjax.Resample(), propagate], 200,
         initial_moves=[SelectInitial(propagate, 8)],

@@ -215,16 +215,15 @@ def own_chain(*moves):
 EVERYWHERE = {
     "guided mpf rqmc": lambda inputs: mpfjax.mixture_particle_filter(
         (model := Driven(inputs=inputs)), 32, 2, noise="rqmc",
-        proposal=mpfjax.GaussNewtonProposal(model),
+        proposal=mpfjax.GaussNewtonProposal(),
     ),
     "look-ahead": lambda inputs: mpfjax.auxiliary_particle_filter(
         (model := Driven(inputs=inputs)), 32, look_ahead(model)
     ),
-    "families": own_chain(lambda model: mpfjax.PropagateNested(mpfjax.Propagate(model), 2)),
-    "stages": own_chain(lambda model: mpfjax.PropagateTempered(model)),
+    "families": own_chain(lambda model: mpfjax.PropagateNested(mpfjax.Propagate(), 2)),
+    "stages": own_chain(lambda model: mpfjax.PropagateTempered()),
     "a proposal with a model of its own": own_chain(
-        lambda model: mpfjax.Propagate(
-            model, mpfjax.GaussNewtonProposal(Driven(jnp.array(0.5), inputs=model.inputs))
+        lambda model: mpfjax.Propagate(mpfjax.GaussNewtonProposal()
         )
     ),
     "ps": of_objects(lambda joint: mpfjax.partitioned_sampling(joint, 32)),

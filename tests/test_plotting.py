@@ -18,7 +18,7 @@ def segments_of(collection):
 def test_components_stand_where_their_moments_are():
     """A dot at each living component's mean; bars hold deviations within particles and between."""
     by_regime = [mpfjax.GroupBy(lambda state: state.latent)]
-    moves = [mpfjax.PropagateMarginalised(SWITCHING), mpfjax.Resample(), *by_regime]
+    moves = [mpfjax.PropagateMarginalised(), mpfjax.Resample(), *by_regime]
     filter = mpfjax.Filter(SWITCHING, moves, 40, 3, initial_moves=by_regime)
     mixtures = mpfjax.run_filter(jax.random.key(0), filter, SEEN).collected
     axis = draw_components(mixtures, 1, truth=np.zeros(len(SEEN)), least_mass=0.0).axes[0]

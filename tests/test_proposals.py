@@ -42,7 +42,7 @@ def gaussian_fit(previous, observation):
 
 
 def test_the_log_density_is_that_of_the_gaussian_it_draws_from():
-    proposal = GaussNewtonProposal(LINEAR, inflation=1.3)
+    proposal = GaussNewtonProposal(inflation=1.3)
     states, log_density = propose(proposal, jax.random.key(1), OBSERVATION, PREVIOUS)
     means, covariance = gaussian_fit(PREVIOUS, OBSERVATION)
     expected = [
@@ -56,7 +56,7 @@ def test_the_log_density_is_that_of_the_gaussian_it_draws_from():
 
 def test_on_a_linear_model_the_weight_is_the_normaliser_whatever_is_drawn():
     """The locally optimal proposal: L D / q is p(y_t | x_{t-1}), which SciPy knows."""
-    proposal = GaussNewtonProposal(LINEAR, inflation=1.0, num_iterations=1)
+    proposal = GaussNewtonProposal(inflation=1.0, num_iterations=1)
     states, log_density = propose(proposal, jax.random.key(3), OBSERVATION, PREVIOUS)
     weights = LINEAR.log_likelihood(OBSERVATION, states) - log_density
     weights += LINEAR.log_transition(states, PREVIOUS)
@@ -64,7 +64,7 @@ def test_on_a_linear_model_the_weight_is_the_normaliser_whatever_is_drawn():
     predictive = scipy.stats.multivariate_normal(np.zeros(2), H @ Q @ H.T + R)
     predicted = np.asarray(LINEAR.observation_mean(LINEAR.transition_mean(PREVIOUS)), float)
     expected = predictive.logpdf(np.asarray(OBSERVATION, float) - predicted)
-    inflated = GaussNewtonProposal(LINEAR, inflation=1.7)
+    inflated = GaussNewtonProposal(inflation=1.7)
     for found in (weights, inflated.log_normaliser(OBSERVATION, PREVIOUS)):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 
@@ -73,7 +73,7 @@ def test_on_the_quadratic_model_it_finds_the_mode_of_each_particles_own_side():
     previous, ends = [1.2, -1.2, 0.8, -0.8], [1.0, -1.0, 1.0, -1.0]
     with float64():
         model = mpfjax.QuadraticModel(0.5, 0.1)
-        proposal = GaussNewtonProposal(model, num_iterations=8, inflation=0.01)
+        proposal = GaussNewtonProposal(num_iterations=8, inflation=0.01)
         key, seen = jax.random.key(5), jnp.array(1.0)
         states, log_density = propose(proposal, key, seen, jnp.array(previous))
         assert states.dtype == log_density.dtype == np.float64

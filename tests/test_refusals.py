@@ -80,7 +80,7 @@ def alike(arguments, *functions):
 FILTERED = {"key": KEY, "filter": FILTER, "observations": TWO}
 COLLECTED = FILTERED | {"collect": nothing}
 MANY = {"keys": KEY[None], "observations": TWO}
-GUIDE = mpfjax.GaussNewtonProposal(MODEL)
+GUIDE = mpfjax.GaussNewtonProposal()
 # The arguments of a good call that have no default, or whose default leaves something out.
 GOOD = {
     **alike({}, mpfjax.QuadraticModel, KMeans, mpfjax.Split, mpfjax.Prune, IslandInteraction),
@@ -119,10 +119,10 @@ GOOD = {
     mpfjax.RandomPartition: {"num_sets": 2},
     mpfjax.GroupBy: {"function": nothing},
     mpfjax.Every: {"num_steps": 2, "moves": [KMeans(1)]},
-    mpfjax.PropagateNested: {"propagate": Propagate(MODEL), "num_draws": 2},
+    mpfjax.PropagateNested: {"propagate": Propagate(), "num_draws": 2},
     mpfjax.PropagateTempered: {"model": MODEL, "resample": Resample(), "exponents": (0.1, 1.0)},
-    SelectInitial: {"propagation": Propagate(MODEL), "num_draws": 2},
-    Filter: {"model": MODEL, "moves": [Propagate(MODEL)], "num_particles": 4},
+    SelectInitial: {"propagation": Propagate(), "num_draws": 2},
+    Filter: {"model": MODEL, "moves": [Propagate()], "num_particles": 4},
     mpfjax.with_resampling: {"filter": FILTER, "resample": Resample()},
     mpfjax.auxiliary_particle_filter: {"model": MODEL, "num_particles": 4, "lookahead": GUIDE},
     mpfjax.run_filter: COLLECTED,
@@ -329,13 +329,13 @@ def climb(**options):
 # By room: words of the message, and the call.
 REFUSED = (
     # filters and moves
-    ("moves: .* never weigh the particles", lambda: Filter(MODEL, [Resample(), Predict(MODEL)], 4)),
+    ("moves: .* never weigh the particles", lambda: Filter(MODEL, [Resample(), Predict()], 4)),
     ("scale: 2 units for 1 features",
      lambda: mpfjax.mixture_particle_filter(MODEL, 20, 2, scale=[1.0, 2.0]).init(KEY)),
     ("share_by: groups have no effect",
      lambda: Resample(particles_per_component=2, share_by=nothing)),
     ("moves: (?s:.*) neither regroups, resamples nor",
-     lambda: mpfjax.Every(2, [KMeans(), Propagate(MODEL)])),
+     lambda: mpfjax.Every(2, [KMeans(), Propagate()])),
     ("moves: the memory 'every 2: KMeans' is kept by 2", lambda: FILTER.replace(
         moves=[*FILTER.moves, *(mpfjax.Every(2, [KMeans(k)]) for k in (1, 2))])),
     ("function: it returned", lambda: mpfjax.GroupBy(lambda x: jnp.zeros(2, int))(KEY, MIXTURE)),
@@ -428,36 +428,36 @@ REFUSED = (
      lambda: mpfjax.Study(**GOOD[mpfjax.Study] | {"settings": {"filter": [1]}})),
     # propagation, several objects, look-ahead
     ("Batched defines no log_transition, which gradient=",
-     lambda: Propagate(Batched(), gradient="stop")),
-    ("Batched defines no transition_from_noise", lambda: Propagate(Batched(), noise="rqmc")),
-    ("noise_dimension", lambda: Propagate(changed(Drift, noise_dimension=65), noise="rqmc")),
+     lambda: Propagate(gradient="stop")),
+    ("Batched defines no transition_from_noise", lambda: Propagate(noise="rqmc")),
+    ("noise_dimension", lambda: Propagate(noise="rqmc")),
     ("inherits its transition_from_noise, which noise='rqmc' needs",
-     lambda: Propagate(changed(Drift, sample_transition=lambda self, key, x: x), noise="rqmc")),
+     lambda: Propagate(noise="rqmc")),
     ("sort_by: 9 coordinates", lambda: run_of(
         changed(Drift, sample_initial=lambda self, key, n: jnp.zeros((n, 9))), noise="rqmc")),
     ("propagate: gradient 'stop'",
-     lambda: mpfjax.PropagateNested(Propagate(MODEL, gradient="stop"))),
-    ("exponents: .* that rise", lambda: mpfjax.PropagateTempered(MODEL, exponents=(0.1, 0.5))),
-    ("resample: sort_by", lambda: mpfjax.PropagateTempered(MODEL, Resample(sort_by="hilbert"))),
+     lambda: mpfjax.PropagateNested(Propagate(gradient="stop"))),
+    ("exponents: .* that rise", lambda: mpfjax.PropagateTempered(exponents=(0.1, 0.5))),
+    ("resample: sort_by", lambda: mpfjax.PropagateTempered(Resample(sort_by="hilbert"))),
     ("comes before any propagation: there is no x_t yet",
-     lambda: run(Filter(MODEL, [mpfjax.RandomWalkMetropolis(MODEL), Propagate(MODEL)], 4))),
-    ("IslandInteraction leaves no particle one parent", lambda: Filter(MODEL, [Propagate(MODEL),
-        mpfjax.Every(2, [IslandInteraction()]), mpfjax.RandomWalkMetropolis(MODEL)], 4)),
-    ("model: .* is conditionally linear", lambda: Reweight(SWITCHING, 0.5)),
+     lambda: run(Filter(MODEL, [mpfjax.RandomWalkMetropolis(), Propagate()], 4))),
+    ("IslandInteraction leaves no particle one parent", lambda: Filter(MODEL, [Propagate(),
+        mpfjax.Every(2, [IslandInteraction()]), mpfjax.RandomWalkMetropolis()], 4)),
+    ("model: .* is conditionally linear", lambda: Reweight(0.5)),
     ("object_model: .* is conditionally linear",
      lambda: mpfjax.ClutteredModel(SWITCHING, 0.9, 0.1)),
     ("orders: ", lambda: mpfjax.partitioned_sampling(JOINT, 10, (0, 0))),
     ("orders: 2 of them, for 1 components",
-     lambda: run(Filter(JOINT, [mpfjax.Partitioned(JOINT, [(0, 1), (1, 0)])], 4))),
+     lambda: run(Filter(JOINT, [mpfjax.Partitioned([(0, 1), (1, 0)])], 4))),
     ("mixture: 2 components, not one",
-     lambda: run(Filter(JOINT, [PropagateIndependently(JOINT)], 4, 2))),
+     lambda: run(Filter(JOINT, [PropagateIndependently()], 4, 2))),
     ("filter: .*cannot look ahead", lambda: smoothing.learn_lookahead(
-        KEY, Filter(MODEL, [mpfjax.GaussianRegeneration(), Propagate(MODEL)], 4), TWO)),
+        KEY, Filter(MODEL, [mpfjax.GaussianRegeneration(), Propagate()], 4), TWO)),
     # smoothing
     ("observations: .3. steps", lambda: paths(
         run_of(SWITCHING, TWO[:, None]), SWITCHING, observations=THREE[:, None])),
     ("component: 1 is dead",
-     lambda: paths(run(Filter(MODEL, [Propagate(MODEL)], 4, 2)), component=1)),
+     lambda: paths(run(Filter(MODEL, [Propagate()], 4, 2)), component=1)),
     ("mixtures: these are not all", lambda: paths(HISTORY.final)),
     (r"mixtures: \[ParticleMixture\(particles=f32\[4\], .* is not", lambda: paths([MIXTURE])),
     (r"q: 90 is not in \[0, 1\]", lambda: MIXTURE.quantile(MIXTURE.particles, 90)),
@@ -466,7 +466,7 @@ REFUSED = (
         (f"filter: .*{words}", lambda filter=filter: around(filter))
         for words, filter in (
             ("needs noise='independent'", mpfjax.with_point_sets(FILTER)),
-            ("one Propagate or Predict", Filter(MODEL, [Reweight(MODEL)], 4)),
+            ("one Propagate or Predict", Filter(MODEL, [Reweight()], 4)),
             ("PropagateNested cannot keep", mpfjax.with_proposals_per_particle(FILTER, 2)),
             ("Partitioned cannot keep", mpfjax.partitioned_sampling(JOINT, 4)),
             ("GaussianRegeneration cannot keep", GAUSSIAN),

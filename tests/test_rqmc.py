@@ -62,7 +62,7 @@ def pf():
 
 
 def never_resampled():
-    return mpfjax.Filter(WALK, [PropagateNested(Propagate(WALK, noise="rqmc"), 2)], SIZE)
+    return mpfjax.Filter(WALK, [PropagateNested(Propagate(noise="rqmc"), 2)], SIZE)
 
 
 # A filter, observations, what is estimated (None is log Ẑ), its exact value, and √N times the most
@@ -138,7 +138,7 @@ def test_standardised_coordinates_make_units_immaterial():
 
 
 def test_components_of_one_particle_and_all_particles_at_one_point():
-    propagate = eqx.filter_jit(Propagate(Drift(), noise="rqmc"))
+    propagate = eqx.filter_jit(Propagate(noise="rqmc"))
     labels = np.array([0, 1, 2, 3, 4, 4, 4, 4, 4, 4])
     for states in (np.ones((10, 2)), np.arange(20.0).reshape(10, 2)):
         mixture = make_mixture(states, np.zeros(10), labels, 5)

@@ -32,7 +32,7 @@ OBSERVATIONS = np.array([1.5, 1.0, 0.4], np.float32)
 
 def own_chain():
     """A chain that no recipe makes, with a resampling from time to time."""
-    moves = [Every(2, [Resample("stratified"), KMeans(2)]), Propagate(MODEL)]
+    moves = [Every(2, [Resample("stratified"), KMeans(2)]), Propagate()]
     return Filter(MODEL, moves, 32, 2, initial_moves=[KMeans(3, reseed=True)])
 
 
@@ -77,7 +77,7 @@ def test_the_score_gradient_reaches_the_resampling_inside_of_moves():
 
 
 def test_point_sets_sort_the_chains_own_resampling_alone():
-    filter = with_point_sets(mpfjax.auxiliary_particle_filter(MODEL, 16, PilotLookahead(MODEL)))
+    filter = with_point_sets(mpfjax.auxiliary_particle_filter(MODEL, 16, PilotLookahead()))
     assert filter.moves[0].resample.sort_by == "hilbert"
     own = Resample(sort_by=lambda states: -states)
     kept = with_point_sets(with_resampling(mpfjax.particle_filter(MODEL, 16), own))
@@ -86,7 +86,7 @@ def test_point_sets_sort_the_chains_own_resampling_alone():
 
 def test_a_look_ahead_and_proposals_are_put_on_and_taken_off():
     plain = mpfjax.particle_filter(MODEL, 16)
-    guide = mpfjax.GaussNewtonProposal(MODEL)
+    guide = mpfjax.GaussNewtonProposal()
     ahead = with_lookahead(plain, guide)
     assert isinstance(ahead.moves[0], AuxiliaryResample)
     assert isinstance(ahead.moves[1].proposal, mpfjax.GaussNewtonProposal)

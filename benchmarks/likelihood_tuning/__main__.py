@@ -109,7 +109,7 @@ def build_filter(name: str, model: Any, num_particles: int, estimator: Any) -> m
         if name == "pf":
             return mpfjax.particle_filter(model, num_particles, gradient=estimator)
         return mpfjax.mixture_particle_filter(model, num_particles, 2, gradient=estimator)
-    moves = [mpfjax.Resample(gradient="stop"), mpfjax.Propagate(model)]
+    moves = [mpfjax.Resample(gradient="stop"), mpfjax.Propagate()]
     if name == "pf":
         return mpfjax.Filter(model, moves, num_particles)
     grouping = [mpfjax.Merge(), mpfjax.Split(), mpfjax.KMeans()]

@@ -111,7 +111,7 @@ def mixture(model: Any, num_particles: int, max_components: int) -> mpfjax.Filte
 FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
     "particle filter": lambda model, n, m: mpfjax.particle_filter(model, n, ess_threshold=0.5),
     "replacing 1%": lambda model, n, m: mpfjax.Filter(
-        model, [mpfjax.Resample(), partial(replace_some, model), mpfjax.Propagate(model)], n
+        model, [mpfjax.Resample(), partial(replace_some, model), mpfjax.Propagate()], n
     ),
     "AMCL": lambda model, n, m: mpfjax.Filter(model, [AdaptiveMonteCarlo(model)], 5000),
     "mixture": mixture,

@@ -78,13 +78,13 @@ def main(
 
 
 def _auxiliary(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
-    proposal = mpfjax.GaussNewtonProposal(model)
+    proposal = mpfjax.GaussNewtonProposal()
     plain = mpfjax.mixture_particle_filter(model, num_particles, 2)
     return mpfjax.with_point_sets(mpfjax.with_lookahead(plain, proposal))
 
 
 def _guided(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
-    proposal = mpfjax.GaussNewtonProposal(model)
+    proposal = mpfjax.GaussNewtonProposal()
     return mpfjax.mixture_particle_filter(model, num_particles, 2, proposal=proposal, noise="rqmc")
 
 

@@ -73,7 +73,7 @@ def measure(job: Quadratic, num_particles: int, num_steps: int, seed: int) -> Dr
     """Each sampler on the same filter, from the same start."""
     model: Any = model_of(job)
     filter = mpfjax.mixture_particle_filter(
-        model, num_particles, 2, proposal=mpfjax.GaussNewtonProposal(model)
+        model, num_particles, 2, proposal=mpfjax.GaussNewtonProposal()
     )
     observations = job.observations
     chosen: dict[str, Any] = {

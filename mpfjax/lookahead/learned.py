@@ -20,7 +20,10 @@ from mpfjax.models.conditionally_linear import is_mixed, with_moments
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.observations import as_series
 from mpfjax.models.steps import noise_dimension
+from mpfjax.moves.base import AbstractRegrouping, name_of
+from mpfjax.moves.every import Every
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
+from mpfjax.moves.resampling.resample import Resample
 from mpfjax.running.run import run_filter
 
 # So many times the particles of a run in each pass.
@@ -117,23 +120,24 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
     """The filter whose moves look ahead by `twist`; a `ValueError` for one that cannot."""
 
     def ahead(move: Any) -> Any:
-        if move.regroups:
+        if isinstance(move, AbstractRegrouping):
             return RegroupTwisted(move, twist)
-        if move.resampling is not None:
+        if isinstance(move, AuxiliaryResample):
+            return ahead(move.resample)
+        if isinstance(move, Resample):
             # Masses of today tell little where ψ knows what is to come: each ψ_t errs by its fit.
-            equally = dataclasses.replace(move.resampling, allocation="equal")
-            return AuxiliaryResample(equally, twist)
+            return AuxiliaryResample(dataclasses.replace(move, allocation="equal"), twist)
         if hasattr(move, "from_noise") and move.gradient == "none":
             return PropagateTwisted(dataclasses.replace(move, proposal=None), twist)
-        if move.inner:
+        if isinstance(move, Every):
             return move.map_inner(ahead)
-        who = f"filter: {type(move).__name__}"
+        who = f"filter: {name_of(move)}"
         raise ValueError(f"{who} cannot look ahead, as Resample, Propagate and regrouping can")
 
     moves = [ahead(move) for move in filter.moves]
     for kind, needed in ((AuxiliaryResample, "Resample"), (PropagateTwisted, "Propagate")):
         if sum(isinstance(move, kind) for move in moves) != 1:
             raise ValueError(f"filter: its moves need one {needed}, in the chain itself")
-    start = TwistInitial(filter.model, twist, filter.initial_noise)
+    start = TwistInitial(twist, filter.initial_noise)
     kept = [ahead(move) for move in filter.initial_moves if not move.weighs]
     return filter.replace(moves=moves, num_particles=num_particles, initial_moves=[start, *kept])

@@ -1,23 +1,36 @@
 """A look-ahead that a model made of noise has of itself."""
 
+import abc
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, require_noise
+from mpfjax.models.base import require_noise
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.steps import likelihoods
+from mpfjax.moves.base import Given, Step
 from mpfjax.moves.initial import trusted
-from mpfjax.proposals import AbstractProposal
+from mpfjax.moves.propagation.proposals import AbstractProposal
 
 
-class PilotLookahead(eqx.Module):
+class AbstractLookahead(Given):
+    """A look-ahead ν to y_t that depends on the step, or on the whole mixture."""
+
+    def check(self, now: Step) -> None:
+        """Raise a `ValueError` for a model that it is not for; most are for any."""
+        del now
+
+    @abc.abstractmethod
+    def log_factors(self, mixture: ParticleMixture, now: Step) -> Float[Array, " n"]:
+        """log ν of each particle."""
+
+
+class PilotLookahead(AbstractLookahead):
     """The likelihoods of two places to which a particle may move, trusted as far as they agree.
 
     For `lookahead` of `mixture_particle_filter`, `auxiliary_particle_filter` and
@@ -30,31 +43,27 @@ class PilotLookahead(eqx.Module):
     ν is at least 1/4, so that no weight grows to more than four times what it was.
 
     It needs no random numbers and nothing but the model, and costs two transitions and two
-    likelihoods a particle. Raises `ValueError` for a model without `transition_from_noise`. Use it
-    where a step of the dynamics is narrow beside the likelihood, in several dimensions, above all
-    with `noise="rqmc"`.
+    likelihoods a particle. Raises `ValueError` in a filter of a model without
+    `transition_from_noise`. Use it where a step of the dynamics is narrow beside the likelihood, in
+    several dimensions, above all with `noise="rqmc"`.
     """
 
-    model: AbstractStateSpaceModel
+    def check(self, now: Step) -> None:
+        """Raise a `ValueError` for a model that does not make x_t of noise."""
+        refuse_marginalised(now.model, "PilotLookahead")
+        require_noise(now.model, "PilotLookahead")
 
-    def __check_init__(self) -> None:
-        refuse_marginalised(self.model, "PilotLookahead")
-        require_noise(self.model, "PilotLookahead")
-
-    def at_step_of(self, mixture: ParticleMixture) -> Callable[[PyTree, PyTree], Array]:
-        """(y_t, states) -> log ν, by the weights of the mixture."""
-        model: Any = self.model
-
-        def look(observation: PyTree, states: PyTree) -> Float[Array, " n"]:
-            ones = jnp.ones((mixture.num_particles, model.noise_dimension), noise_dtype(states))
-            seen = [
-                likelihoods(model, observation, model.transition_from_noise(noise, states))
-                for noise in (ones, -ones)
-            ]
-            # Any ν is exact, so that its derivative is not needed.
-            return jax.lax.stop_gradient(jnp.log(trusted(jnp.stack(seen), mixture.weights)))
-
-        return look
+    def log_factors(self, mixture: ParticleMixture, now: Step) -> Float[Array, " n"]:
+        """log ν of each particle, by the weights of the mixture."""
+        model: Any = now.model
+        states = mixture.particles
+        ones = jnp.ones((mixture.num_particles, model.noise_dimension), noise_dtype(states))
+        looks = [
+            likelihoods(model, now.observation, model.transition_from_noise(noise, states))
+            for noise in (ones, -ones)
+        ]
+        # Any ν is exact, so that its derivative is not needed.
+        return jax.lax.stop_gradient(jnp.log(trusted(jnp.stack(looks), mixture.weights)))
 
 
-Lookahead = AbstractProposal | PilotLookahead | Callable[[PyTree, PyTree], Array]
+Lookahead = AbstractProposal | AbstractLookahead | Callable[[PyTree, PyTree], Array]

@@ -6,22 +6,30 @@ from typing import Any, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree
 
+from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.models.base import AbstractStateSpaceModel, check_moved
+from mpfjax.models.base import check_moved
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.noise import draw_noise, noise_dtype
 from mpfjax.models.steps import completed, made_of, noise_dimension, seen
-from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
+from mpfjax.moves.base import (
+    AbstractMove,
+    AbstractPropagation,
+    AbstractRegrouping,
+    AbstractWrapper,
+    Step,
+    is_missing,
+)
 from mpfjax.moves.propagation.propagate import noise_of_slots
 from mpfjax.operations.logarithms import log_sum_exp
 
 STEP = "twisted"
 
 
-class Twist(eqx.Module):
+class Twist(AbstractLookahead):
     """ψ_1, ..., ψ_T for the steps of a series, as `mpfjax.smoothing.learn_lookahead` fits them.
 
     It is the look-ahead of an `AuxiliaryResample`, ν_t(x_{t-1}) of the step.
@@ -35,8 +43,6 @@ class Twist(eqx.Module):
     initial: LocalQuadratics | None
     features: Callable[[PyTree], Array] = flatten_states
 
-    reads = frozenset({STEP})
-
     def next(self, mixture: ParticleMixture) -> LocalQuadratics:
         """ψ of the step that takes the particles on from where they are."""
         place = jnp.minimum(mixture.memory[STEP]["step"], self.steps.log_cap.shape[0] - 1)
@@ -47,10 +53,10 @@ class Twist(eqx.Module):
         found = jnp.asarray(self.features(states))
         return found.reshape(found.shape[0], -1).astype(noise_dtype(states))
 
-    def at_step_of(self, mixture: ParticleMixture) -> Callable[[PyTree, PyTree], Array]:
-        """log ν of the next step, as a function of y_t, which it does not use, and the states."""
-        psi = self.next(mixture)
-        return lambda observation, states: psi.log_normaliser(self.features_of(states))
+    def log_factors(self, mixture: ParticleMixture, now: Step | None = None) -> Float[Array, " n"]:
+        """log ν of the next step, whatever y_t is."""
+        del now
+        return self.next(mixture).log_normaliser(self.features_of(mixture.particles))
 
 
 class TwistInitial(AbstractMove):
@@ -59,27 +65,23 @@ class TwistInitial(AbstractMove):
     Their mass is part of the first increment, so that Ẑ stays unbiased.
     """
 
-    model: AbstractStateSpaceModel
     twist: Twist
     noise: str = eqx.field(static=True, default="independent")
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """The mixture of the twisted draws."""
-        del observation
         if self.twist.initial is None:
             return mixture
-        psi, model = self.twist.initial, cast(Any, self.model)
+        psi, model = self.twist.initial, cast(Any, now.model)
         shape, dtype = (mixture.num_particles, model.initial_noise_dimension + 1), psi.slopes.dtype
         noise = draw_noise(self.noise, key, shape, dtype)
         drawn, log_ratio = psi.draw(noise, jnp.zeros((shape[0], 1), dtype))
         states = with_moments(model, model.initial_from_noise(drawn))
-        check_moved(states, mixture.particles, self.model, "initial_from_noise")
+        check_moved(states, mixture.particles, model, "initial_from_noise")
         return mixture.replace(particles=states).weighed(log_ratio)
 
 
-class PropagateTwisted(AbstractPropagation):
+class PropagateTwisted(AbstractPropagation, AbstractWrapper):
     """Draw the noise ε of x_t from q_t(ε | x_{t-1}), and weigh by L(y_t | x_t) N(ε; 0, I) / q_t.
 
     No density of the dynamics is needed, which may be singular or mixed with discrete draws. For a
@@ -90,27 +92,25 @@ class PropagateTwisted(AbstractPropagation):
     move: Any
     twist: Twist
 
-    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+    holds = ("move",)
+
+    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """The number of steps so far."""
-        del num_components
+        del model, num_components
         return {STEP: {"step": jnp.zeros((), jnp.int32)}}
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
-        model, previous = self.move.model, mixture.particles
+        if is_missing(now):
+            return _counted(self.move(key, mixture, now))
+        model, previous = now.model, mixture.particles
         dimension = noise_dimension(model, previous) + 1
         noise = noise_of_slots(self.move.noise, key, dimension, mixture)
         psi = self.twist.next(mixture)
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
         made = completed(model, made_of(model, drawn, previous), previous)
-        states, log_factors = seen(model, observation, made)
+        states, log_factors = seen(model, now.observation, made)
         return _counted(mixture.replace(particles=states).weighed(*log_factors, log_ratio))
-
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
-        return _counted(self.move.predict(key, mixture))
 
 
 def _counted(mixture: ParticleMixture) -> ParticleMixture:
@@ -118,7 +118,7 @@ def _counted(mixture: ParticleMixture) -> ParticleMixture:
     return mixture.replace(memory=mixture.memory | {STEP: {"step": step}})
 
 
-class RegroupTwisted(AbstractRegrouping):
+class RegroupTwisted(AbstractWrapper, AbstractRegrouping):
     """A regrouping with the weights times ν_{t+1}(x_t), by which the next step resamples.
 
     Under the weights of the filtering distribution alone few particles carry the mass, because the
@@ -128,29 +128,13 @@ class RegroupTwisted(AbstractRegrouping):
     move: AbstractRegrouping
     twist: Twist
 
-    @property
-    def reads(self) -> frozenset[str]:
-        """The number of the step, and that which the move reads."""
-        return self.twist.reads | self.move.reads
-
-    @property
-    def needs_parents(self) -> bool:
-        """Whether the move needs them."""
-        return self.move.needs_parents
+    holds = ("move",)
 
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
         """The move's indicators under the weights times ν_{t+1}."""
-        log_factors = self.twist.at_step_of(mixture)(None, mixture.particles)
+        log_factors = self.twist.log_factors(mixture)
         log_weights = mixture.weighed(log_factors).log_weights
         log_weights = log_weights - log_sum_exp(log_weights)
         return self.move.regroup(key, mixture.replace(log_weights=log_weights))
-
-    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """The memory of the move."""
-        return self.move.initial_memory(num_components)
-
-    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
-        """The memory without dead components."""
-        return self.move.forget(memory, dead)

@@ -98,7 +98,7 @@ def with_inputs(model: Any, inputs: PyTree) -> Any:
     return replaced(model, inputs=inputs)
 
 
-def replaced(model: Any, **fields: Any) -> Any:
+def replaced(model: Any, /, **fields: Any) -> Any:
     """A copy of a model with some fields set, without checks or conversions."""
     changed = copy.copy(model)
     for name, value in fields.items():

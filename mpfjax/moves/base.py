@@ -1,153 +1,143 @@
 """The kinds of moves of a filter, and their contracts."""
 
 import abc
-from collections import ChainMap
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import Checked, check, is_series, shown
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.operations.logarithms import without_gradient
 
 Gradient = Literal["none", "stop"]
 
 
-class AbstractMove(Checked):
-    """A step of a filter, `(key, mixture, observation) -> mixture`.
+class Step(eqx.Module):
+    """What a move is given of the step that it takes part in: `move(key, mixture, now)`."""
+
+    model: AbstractStateSpaceModel
+    """the filter's own model, at u_t."""
+    observation: PyTree = None
+    """y_t; None where it is missing, and most moves then do nothing."""
+    propagation: "AbstractPropagationOfEach | None" = None
+    """how the filter itself draws and weighs x_t of a particle, `(key, mixture, now) -> mixture`;
+    None where no move of its chain can."""
+
+
+class Given(Checked):
+    """A base of what a filter gives its model, so that it may hold none itself."""
+
+    def __check_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if isinstance(getattr(self, name), AbstractStateSpaceModel):
+                who = type(self).__name__
+                raise ValueError(f"{name}: {who} holds no model; the filter gives it its own")
+        super().__check_init__()
+
+
+class AbstractMove(Given):
+    """A step of a filter, `(key, mixture, now) -> mixture`, where `now` is a `Step`.
 
     The kind of a move is its contract. An `AbstractRegrouping` does not change the distribution.
     An `AbstractResampling` does not change the mass of any component. An `AbstractPropagation`
     takes the particles from t-1 to t. An `AbstractMarkovMove` moves x_t by a kernel that leaves
-    its distribution invariant. A move is `approximate` if it is not part of the exact recursion;
-    the marginal likelihood is then no longer unbiased.
+    its distribution invariant. An `AbstractWrapper` holds other moves. What the kind does not say,
+    the move says in the attributes and methods below.
     """
 
     approximate = False
-    """whether the move departs from the exact recursion."""
+    """whether the move is not part of the exact recursion, so that Ẑ is no longer unbiased."""
     weighs = True
     """whether it may change the weights by what was observed; a filter needs one that does."""
     keeps_mass = False
     """whether the mass of all particles stays what it was, so that nothing is to be normalised."""
-    propagates = False
-    """whether it takes the particles from t-1 to t."""
-    draws_each = False
-    """whether it draws and weighs x_t of each particle without a look at the others, so that it may
-    be asked for several draws of each."""
-    regroups = False
-    """whether it changes the indicators and nothing else."""
-    resamples = False
-    """whether it redraws the particles by their weights."""
     needs_parents = False
     """whether it looks at `mixture.parents`, x_{t-1} of each particle that has x_t. If one of its
     moves does, a filter keeps them during the step. Otherwise they cost nothing."""
     keeps_parents = True
-    """whether each particle comes from one particle of the mixture that the move was given. Where
-    it does not, the move sets its ancestor index to -1, and what follows ancestors refuses it."""
-    biases_score = False
-    """whether it redraws particles in a way that derivatives in the model's parameters do not see,
-    so that the score is biased."""
+    """whether each particle comes from one particle of the mixture that the move was given, or
+    begins anew. Where it does not, what follows ancestors refuses the move."""
     keeps_families = True
     """whether it draws independently, or tells the memory of first ancestors, so that the errors of
     one run are known."""
-    resampling = None
-    """the `Resample` by which it redraws the particles, whose weights a look-ahead may change."""
-    keeps_trajectories = False
-    """whether conditional SMC, which keeps one trajectory, may run it as it is."""
-    inner = ()
-    """the moves that it runs from time to time."""
-    particles_per_component = None
-    """the slots that each component gets, where the move fixes their number."""
+    biases_score = False
+    """whether it redraws particles in a way that derivatives in the model's parameters do not see,
+    so that the score is biased."""
+    holds = ()
+    """the names of the fields with the moves that it runs; see `AbstractWrapper`."""
 
     @abc.abstractmethod
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Move the mixture, given y_t."""
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
+        """Move the mixture at this step."""
 
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a model or numbers of a filter that it cannot work with."""
+        del now, num_particles, num_components
+
+    def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
         """Which components the move would resample, for the report of a step; most moves none."""
-        del observation
+        del now
         return jnp.zeros(mixture.num_components, bool)
+
+    def initial_memory(
+        self, model: AbstractStateSpaceModel, num_components: int
+    ) -> dict[str, PyTree]:
+        """The initial memory of the move, under its own name; most moves have none."""
+        del model, num_components
+        return {}
 
     def around(self, reference: Any) -> "AbstractMove":
         """The move in conditional SMC, which keeps one trajectory, a `Reference`; most cannot."""
         del reference
-        if self.keeps_trajectories:
-            return self
         who = f"filter: {type(self).__name__}"
         raise ValueError(f"{who} cannot keep a trajectory, as Resample and Propagate can")
 
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """The move when y_t is missing. Only a propagation does anything then."""
-        del key
-        return mixture
-
-    def map_inner(self, change: Callable[[Any], Any]) -> Any:
-        """The move with `change(move)` in the place of each move that it runs for the chain."""
-        del change
-        return self
-
     def evidence_against(
-        self, mixture: ParticleMixture, observation: PyTree, increment: Float[Array, ""]
+        self, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
     ) -> Float[Array, ""] | None:
         """The report's `log_evidence_against_start` after a step; None of a move that has none."""
-        del mixture, observation, increment
+        del mixture, now, increment
         return None
 
     @property
-    def reads(self) -> frozenset[str]:
-        """The names of the memory of other moves that this move needs.
+    def inner(self) -> "Moves":
+        """The moves that it runs."""
+        fields = (getattr(self, name) for name in self.holds)
+        return tuple(m for held in fields for m in (held if isinstance(held, tuple) else (held,)))
 
-        A filter itself keeps "log_increment" for moves that read it: the growth of the mass in the
-        step so far, which after a propagation is log p(y_t | y_1..y_{t-1}).
-        """
-        return frozenset()
-
-    @property
-    def own_memory(self) -> frozenset[str]:
-        """The names of the memory that the move keeps."""
-        return frozenset(eqx.filter_eval_shape(self.initial_memory, 1))
-
-    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """The initial memory of the move, under its own name; most moves have none."""
-        del num_components
-        return {}
-
-    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
-        """The mixture's memory without this move's memory of dead components.
-
-        A filter calls this after each move, so that a label that is used again has no past.
-        """
-        del dead
-        return memory
+    def map_inner(self, change: Callable[[Any], Any]) -> Any:
+        """The move with `change(move)` in the place of each move that it runs."""
+        if not self.holds:
+            return self
+        changed = {}
+        for name in self.holds:
+            held = getattr(self, name)
+            changed[name] = tuple(map(change, held)) if isinstance(held, tuple) else change(held)
+        return dataclasses.replace(self, **changed)
 
 
 Moves = tuple[AbstractMove, ...]
 
 
 class FunctionMove(AbstractMove):
-    """A function `(key, mixture, observation) -> mixture` as a move; what it does is not known."""
+    """A function `(key, mixture, now) -> mixture` as a move; what it does is not known.
+
+    Where y_t is missing, it is called with `now.observation` None.
+    """
 
     function: Callable[..., ParticleMixture]
 
     approximate = True
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """What the function returns."""
-        return self.function(key, mixture, observation)
-
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Raise a `ValueError`: a function does not say what it does without an observation."""
-        del key, mixture
-        raise ValueError(f"moves: {self.function!r} does not define predict, for a missing y_t")
+        return self.function(key, mixture, now)
 
 
 def as_moves(moves: Any, name: str) -> Moves:
@@ -156,7 +146,7 @@ def as_moves(moves: Any, name: str) -> Moves:
         raise ValueError(f"{name}: {shown(moves)} is not a list of moves")
     moves = tuple(moves)
     for move in moves:
-        check(Callable[..., Any], "a move, (key, mixture, observation) -> mixture", **{name: move})
+        check(Callable[..., Any], "a move, (key, mixture, now) -> mixture", **{name: move})
     return tuple(m if isinstance(m, AbstractMove) else FunctionMove(m) for m in moves)
 
 
@@ -166,25 +156,29 @@ def name_of(move: AbstractMove) -> str:
     return getattr(function, "__name__", type(function).__name__)
 
 
-def with_inner(moves: Iterable[AbstractMove]) -> Iterator[AbstractMove]:
-    """The moves, and after each of them those that it runs from time to time."""
+def all_of(moves: Iterable[AbstractMove]) -> Iterator[AbstractMove]:
+    """The moves, and before each of them those that it runs."""
     for move in moves:
+        yield from all_of(move.inner)
         yield move
-        yield from with_inner(move.inner)
 
 
-def initial_memory(moves: Iterable[AbstractMove], num_components: int) -> dict[str, PyTree]:
-    """The initial memory of all moves."""
-    return dict(ChainMap(*(move.initial_memory(num_components) for move in moves)))
-
-
-def without_dead(
-    moves: Moves, memory: dict[str, PyTree], dead: Bool[Array, " m"]
+def memory_of(
+    moves: Iterable[AbstractMove], model: AbstractStateSpaceModel, num_components: int
 ) -> dict[str, PyTree]:
-    """The memory of all moves without that of dead components."""
+    """The initial memory of all moves; a `ValueError` where two have one of the same name."""
+    memory: dict[str, PyTree] = {}
     for move in moves:
-        memory = move.forget(memory, dead)
+        own = move.initial_memory(model, num_components)
+        for name in sorted(own.keys() & memory.keys()):
+            raise ValueError(f"moves: two of them keep the memory {name!r}, as {name_of(move)}")
+        memory |= own
     return memory
+
+
+def is_missing(now: Step | None) -> bool:
+    """Whether a move is part of a step without an observation."""
+    return now is not None and now.observation is None
 
 
 Regrouped = tuple[Int[Array, " n"], dict[str, PyTree]]
@@ -199,22 +193,25 @@ class AbstractRegrouping(AbstractMove):
 
     weighs = False
     keeps_mass = True
-    regroups = True
-    keeps_trajectories = True
 
     @abc.abstractmethod
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The new component indicators, and the new memory of the mixture."""
 
     def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:
-        """Regroup the particles; the observation plays no part."""
-        if mixture.num_components == 1:
+        """Regroup the particles, unless y_t is missing."""
+        if mixture.num_components == 1 or is_missing(now):
             return mixture
         # Indicators are whole numbers and have no derivative.
         indicators, memory = self.regroup(key, without_gradient(mixture))
         return mixture.replace(component_indicators=indicators, memory=memory)
+
+    def around(self, reference: Any) -> "AbstractRegrouping":
+        """The move itself, for which all particles are alike."""
+        del reference
+        return self
 
 
 class AbstractResampling(AbstractMove):
@@ -226,8 +223,31 @@ class AbstractResampling(AbstractMove):
 
     weighs = False
     keeps_mass = True
-    resamples = True
     keeps_families = False
+
+    @abc.abstractmethod
+    def resample(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """The mixture with its particles redrawn."""
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
+    ) -> ParticleMixture:
+        """Resample, unless y_t is missing, or the mixture waits for it."""
+        if is_missing(now):
+            return mixture
+        return unless_waiting(self.resample(key, mixture), mixture)
+
+
+def unless_waiting(resampled: ParticleMixture, mixture: ParticleMixture) -> ParticleMixture:
+    """The mixture resampled, or as it was where it waits for an observation."""
+    if mixture.waits is None:
+        return resampled
+    # Not by a condition, which would copy all that goes through it at every step.
+    return jax.tree.map(
+        lambda new, old: new if new is old else jnp.where(mixture.waits, old, new),
+        resampled,
+        mixture.replace(in_order=resampled.in_order),
+    )
 
 
 class AbstractMarkovMove(AbstractMove):
@@ -243,6 +263,75 @@ class AbstractMarkovMove(AbstractMove):
 
 
 class AbstractPropagation(AbstractMove):
-    """A move that draws x_t and multiplies the weights by L D / q, so that the mass changes."""
+    """A move that draws x_t and multiplies the weights by L D / q, so that the mass changes.
 
-    propagates = True
+    Without an observation it draws x_t by the model's own law and leaves the weights. Moves that it
+    holds work within it.
+    """
+
+    weighs = True
+    keeps_mass = False
+
+    # What is resampled within is not the mixture that the step was given, nor its trajectories.
+    would_resample = AbstractMove.would_resample
+    around = AbstractMove.around
+
+
+class AbstractPropagationOfEach(AbstractPropagation):
+    """A propagation that draws and weighs x_t of each particle without a look at the others.
+
+    So it may be asked for several draws of each, or for those of other particles: a filter's first
+    one is `now.propagation` for all its moves.
+    """
+
+
+def _of_inner(together: Callable[..., bool], name: str) -> Any:
+    """An attribute that is so of any of the moves held, or of all."""
+
+    def of_moves(self: AbstractMove) -> bool:
+        return together(getattr(move, name) for move in self.inner)
+
+    return property(of_moves, doc=f"Whether it is so of {together.__name__} of the moves held.")
+
+
+class AbstractWrapper(AbstractMove):
+    """A move that holds moves, and is what they are wherever it does not say otherwise.
+
+    The class names the fields that hold them: `holds = ("moves",)`, each a move or a tuple of
+    moves. Transforms of filters reach all moves by these names.
+    """
+
+    approximate = _of_inner(any, "approximate")
+    weighs = _of_inner(any, "weighs")
+    keeps_mass = _of_inner(all, "keeps_mass")
+    needs_parents = _of_inner(any, "needs_parents")
+    keeps_parents = _of_inner(all, "keeps_parents")
+    keeps_families = _of_inner(all, "keeps_families")
+    biases_score = _of_inner(any, "biases_score")
+
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """The checks of the moves."""
+        for move in self.inner:
+            move.check(now, num_particles, num_components)
+
+    def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
+        """Which components of `mixture` any of the moves would resample."""
+        due = [move.would_resample(mixture, now) for move in self.inner]
+        return jnp.any(jnp.stack(due), axis=0)
+
+    def initial_memory(
+        self, model: AbstractStateSpaceModel, num_components: int
+    ) -> dict[str, PyTree]:
+        """The memory of the moves."""
+        return memory_of(self.inner, model, num_components)
+
+    def around(self, reference: Any) -> Any:
+        """The same with the moves around the trajectory."""
+        return self.map_inner(lambda move: move.around(reference))
+
+    def evidence_against(
+        self, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
+    ) -> Float[Array, ""] | None:
+        """That of the first of the moves that has it."""
+        told = (move.evidence_against(mixture, now, increment) for move in self.inner)
+        return next((each for each in told if each is not None), None)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
-from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.base import AbstractPropagation, Step, is_missing
 from mpfjax.operations.stored import take
 
 REFERENCE = "reference"  # the name of its slot and time in a mixture's memory
@@ -46,36 +46,34 @@ class ConditionalPropagation(AbstractPropagation):
         if self.move.proposal is not None:
             require(self.move.proposal, "log_density", "conditional SMC", "proposal")
 
-    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """The reference slot, and the time of the particles."""
-        del num_components
+        del model, num_components
         time = jnp.zeros((), jnp.int32)
         return {REFERENCE: {"slot": self.reference.first_slot, "time": time}}
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate around x*_t, and weigh as the move does."""
         proposal, previous = self.move.proposal, mixture.particles
-        if proposal is None:
-            return self.move.weighed(self.predict(key, mixture), observation)
-        states, log_density = proposal.propose(key, observation, previous)
+        if proposal is None or is_missing(now):
+            moved = self._with_reference(self.move.predicted(key, mixture, now))
+            return moved if is_missing(now) else self.move.weighed(moved, now)
+        states, log_density = proposal.propose(key, now, previous)
         moved = self._with_reference(mixture.replace(particles=states))
         slot = mixture.memory[REFERENCE]["slot"]
-        own = lambda tree: jax.tree.map(lambda leaf: take(leaf, slot[None]), tree)  # noqa: E731
-        log_own = proposal.log_density(observation, own(moved.particles), own(previous))
-        log_density = put(log_density, log_own[0], slot)
-        return self.move.weighed(moved, observation, previous, log_density)
 
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Draw x_t ~ D(. | x_{t-1}) around x*_t, and leave the weights."""
-        return self._with_reference(self.move.predict(key, mixture))
+        def of_slot(tree: PyTree) -> PyTree:
+            return jax.tree.map(lambda leaf: take(leaf, slot[None]), tree)
+
+        log_own = proposal.log_density(now, of_slot(moved.particles), of_slot(previous))
+        log_density = put(log_density, log_own[0], slot)
+        return self.move.weighed(moved, now, previous, log_density)
 
     def _with_reference(self, mixture: ParticleMixture) -> ParticleMixture:
         """The particles at the next time, with x* of that time in its slot."""
         slot, time = (mixture.memory[REFERENCE][name] for name in ("slot", "time"))
-        now = jax.tree.map(lambda leaf: at(leaf, time + 1), self.reference.trajectory)
-        particles = jax.tree.map(lambda leaf, own: put(leaf, own, slot), mixture.particles, now)
+        states = jax.tree.map(lambda leaf: at(leaf, time + 1), self.reference.trajectory)
+        particles = jax.tree.map(lambda leaf, own: put(leaf, own, slot), mixture.particles, states)
         memory = mixture.memory | {REFERENCE: {"slot": slot, "time": time + 1}}
         return mixture.replace(particles=particles, memory=memory)
 

@@ -1,6 +1,5 @@
 """x_0: its draws, and the choice among many draws by the first observation."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -10,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import Count, shown
+from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, flatten_states, single_component
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -19,7 +18,7 @@ from mpfjax.models.base import (
 )
 from mpfjax.models.conditionally_linear import is_marginalised, with_moments
 from mpfjax.models.noise import Noise, draw_noise
-from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.base import AbstractMove, Step, is_missing
 from mpfjax.moves.propagation.tempered import accepted
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import HILBERT, Line, sorted_order
@@ -90,45 +89,38 @@ class SelectInitial(AbstractMove):
     Without an observation it does nothing. Where an initial move weighs x_0, the chain's `Resample`
     waits for y_1: it would undo the choice.
 
-    - `propagation`: draws x_1, and weighs it: a `Propagate` or `PropagateNested`, usually the
-      filter's own.
+    The filter's own propagation draws x_1, and weighs it.
+
     - `num_draws`: K, or None for that choice.
     - `noise`: that of the draws of x_0, as `Filter.initial_noise`. With "rqmc" they are kept in
       order along a Hilbert curve.
 
-    Put it first among `initial_moves`, before those that regroup. Raises `ValueError` for another
-    propagation, K < 1 and unknown noise. Use it where the prior is wide beside the likelihood.
+    Put it first among `initial_moves`, before those that regroup. Raises `ValueError` for K < 1
+    and unknown noise, and in a filter without `Propagate` or `PropagateNested`. Use it where the
+    prior is wide beside the likelihood.
     """
 
-    propagation: Any
     num_draws: Count | None = eqx.field(static=True, default=None)
     noise: Noise = eqx.field(static=True, default="independent")
 
-    def __check_init__(self) -> None:
-        if not getattr(self.propagation, "draws_each", False):
-            raise ValueError(
-                f"propagation: {shown(self.propagation)} does not draw x_1 of each x_0"
-            )
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` where no move draws x_1 of each x_0."""
+        del num_particles, num_components
+        require_propagation(now, "x_0 is chosen")
 
-    def map_inner(self, change: Callable[[Any], Any]) -> "SelectInitial":
-        """The same with another propagation."""
-        return SelectInitial(change(self.propagation), self.num_draws, self.noise)
-
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """The mixture of the chosen x_0, in one component; without y_1 the one given."""
-        if observation is None:
+        if is_missing(now):
             return mixture
         n = mixture.num_particles
-        start = self._selected(key, observation, n, self.num_draws or FEW_DRAWS)
+        start = self._selected(key, now, n, self.num_draws or FEW_DRAWS)
         if self._may_be_wide(mixture):
-            constant, given, observed = without_gradient((self, mixture.particles, observation))
+            constant, given = without_gradient((now, mixture.particles))
             keys = jax.random.fold_in(key, 1), jax.random.fold_in(key, 2)
             # Draws of their own decide, so that Ẑ stays unbiased.
-            pilot = two_looks(keys[0], constant.propagation, given, observed)
+            pilot, _ = two_looks(keys[0], constant, given)
             is_needed, last_power = is_wide(pilot), power_of(pilot)
-            few, many = start, lambda: self._of_many(keys[1], given, observation, last_power)
+            few, many = start, lambda: self._of_many(keys[1], given, now, last_power)
             dear = cond_if_any(is_needed, many, lambda: few)
             start = jax.tree.map(lambda new, old: jnp.where(is_needed, new, old), dear, few)
         own = {name: getattr(mixture, name) for name in ("ancestor_indices", "memory")}
@@ -141,44 +133,54 @@ class SelectInitial(AbstractMove):
         return self.num_draws is None and self.noise != "rqmc" and has_room and not is_line
 
     def _of_many(
-        self, key: Key[Array, ""], given: PyTree, observation: PyTree, power: Float[Array, ""]
+        self, key: Key[Array, ""], given: PyTree, now: Step, power: Float[Array, ""]
     ) -> ParticleMixture:
         """The start from a wide prior, in which places among the draws have no meaning."""
         n = jax.tree.leaves(given)[0].shape[0]
-        if can_be_tempered(self.propagation.model, given):
-            return tempered_start(key, self.propagation, observation, given, power)
+        if can_be_tempered(now.model, given):
+            return tempered_start(key, now, given, power)
         num_draws = max(FEW_DRAWS, min(MANY_DRAWS, MOST_DRAWS // n))
-        return self._selected(key, observation, n, num_draws)
+        return self._selected(key, now, n, num_draws)
 
-    def _selected(
-        self, key: Key[Array, ""], observation: PyTree, n: int, num_draws: int
-    ) -> ParticleMixture:
+    def _selected(self, key: Key[Array, ""], now: Step, n: int, num_draws: int) -> ParticleMixture:
         """N of K N draws; a few draws a particle at a time, so that memory has room for them."""
         key_drawn, key_look, key_kept = split(key, 3)
         at_once = next(k for k in range(2 * FEW_DRAWS, 0, -1) if num_draws % k == 0)
 
-        def look(keys: Key[Array, "2"]) -> tuple[PyTree, Float[Array, "k 2"]]:
-            drawn = sample_initial(keys[0], self.propagation.model, at_once * n, self.noise)
-            return drawn, two_looks(keys[1], self.propagation, drawn, observation).T
+        def look(keys: Key[Array, "2"]) -> tuple[PyTree, Float[Array, "k 2"], Float[Array, ""]]:
+            drawn = sample_initial(keys[0], now.model, at_once * n, self.noise)
+            log_factors, log_scale = two_looks(keys[1], now, drawn)
+            return drawn, log_factors.T, log_scale
 
         if (num_rounds := num_draws // at_once) == 1:
-            drawn, log_factors = look(jnp.stack([key_drawn, key_look]))
+            drawn, log_factors, _ = look(jnp.stack([key_drawn, key_look]))
         else:
             rounds = [jax.random.split(each, num_rounds) for each in (key_drawn, key_look)]
-            found = jax.lax.map(look, jnp.stack(rounds, axis=1))
+            drawn, log_factors, log_scales = jax.lax.map(look, jnp.stack(rounds, axis=1))
+            log_factors += (log_scales - jnp.max(log_scales))[:, None, None]
             flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
-            drawn, log_factors = jax.tree.map(flat, found)
+            drawn, log_factors = jax.tree.map(flat, (drawn, log_factors))
         return chosen(key_kept, drawn, log_factors.T, n, in_order=self.noise == "rqmc")
 
 
+def require_propagation(now: Step, what: str) -> None:
+    """Raise a `ValueError` for a filter none of whose moves draws x_t of each particle."""
+    if now.propagation is None:
+        raise ValueError(
+            f"filter: {what} where Propagate or PropagateNested propagates, and none of its moves"
+            " is one"
+        )
+
+
 def two_looks(
-    key: Key[Array, ""], propagation: Any, states: PyTree, observation: PyTree
-) -> Float[Array, "2 n"]:
-    """The log-weights of two draws of x_t of each x_{t-1}, up to a constant."""
+    key: Key[Array, ""], now: Step, states: PyTree
+) -> tuple[Float[Array, "2 n"], Float[Array, ""]]:
+    """The log-weights of two draws of x_t of each x_{t-1}, and their common scale."""
+    assert now.propagation is not None
     # Stored, so that x_t is drawn on vectors, and once, not wherever its likelihood is used.
     twice = single_component(states).repeated(2).map_slots(stored)
-    twice = propagation(key, twice, observation)
-    return stored(twice.log_weights).reshape(-1, 2).T
+    twice = now.propagation(key, twice, now)
+    return stored(twice.log_weights).reshape(-1, 2).T, twice.log_scale
 
 
 def chosen(
@@ -232,8 +234,7 @@ def can_be_tempered(model: Any, states: PyTree) -> bool:
 
 def tempered_start(
     key: Key[Array, ""],
-    propagation: Any,
-    observation: PyTree,
+    now: Step,
     given: PyTree,
     last_power: Float[Array, ""],
 ) -> ParticleMixture:
@@ -246,9 +247,11 @@ def tempered_start(
     is moved itself, or the noise that it is made of. In the end every fourth is kept and weighs
     ν^-`last_power`; the mass of all, with a mean of 1, is the `log_scale`.
     """
-    source = propagation.model
-    propagation, observation, given = without_gradient((propagation, observation, given))
-    model, n = propagation.model, jax.tree.leaves(given)[0].shape[0]
+    source: Any = now.model
+    now, given = without_gradient((now, given))
+    propagation: Any = now.propagation
+    model: Any = now.model
+    n = jax.tree.leaves(given)[0].shape[0]
     of_noise, number, dtype = is_made_of_noise(model, "initial"), FEW_DRAWS * n, default_float()
     key_drawn, key_look, key_stages, key_kept = split(key, 4)
     if of_noise:
@@ -266,7 +269,7 @@ def tempered_start(
         return -0.5 * jnp.sum(places**2, axis=1) if of_noise else model.log_initial(places)
 
     def log_look(key: Key[Array, ""], places: PyTree) -> Float[Array, " k"]:
-        seen = propagation(key, single_component(states(model, places)), observation)
+        seen = propagation(key, single_component(states(model, places)), now)
         log_factors = seen.log_weights + seen.log_scale  # up to a constant, which cancels
         return jnp.maximum(jnp.where(log_factors < jnp.inf, log_factors, NOWHERE), NOWHERE)
 
@@ -274,15 +277,15 @@ def tempered_start(
         key, power, growth = stage
         key_drawn, key_size, key_step, key_look, key_accepted = split(key, 5)
         mixture = mixture.weighed(growth * mixture.particles.log_factors)
-        mixture = Resample()(key_drawn, mixture)
-        now = mixture.particles
-        flat = flatten_states(now.places)
+        mixture = Resample().resample(key_drawn, mixture)
+        here = mixture.particles
+        flat = flatten_states(here.places)
         size = scale * LEAST_SIZE ** uniform(key_size, flat.shape, flat.dtype)
         places = to_places(flat + size * normal(key_step, flat.shape, flat.dtype))
         new = Placed(places, log_look(key_look, places))
-        log_ratio = power * (new.log_factors - now.log_factors)
-        log_ratio += log_prior(model, places) - log_prior(model, now.places)
-        return mixture.replace(particles=accepted(key_accepted, log_ratio, new, now)), None
+        log_ratio = power * (new.log_factors - here.log_factors)
+        log_ratio += log_prior(model, places) - log_prior(model, here.places)
+        return mixture.replace(particles=accepted(key_accepted, log_ratio, new, here)), None
 
     powers = last_power * LEAST_POWER ** jnp.linspace(1.0, 0.0, NUM_MOVES, dtype=dtype)
     stages = jax.random.split(key_stages, NUM_MOVES), powers, jnp.diff(powers, prepend=0.0)

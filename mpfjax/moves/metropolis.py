@@ -13,10 +13,10 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, Exponent, InnerShare
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, require
+from mpfjax.models.base import require
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.steps import likelihoods, log_transition
-from mpfjax.moves.base import AbstractMarkovMove, Gradient
+from mpfjax.moves.base import AbstractMarkovMove, Gradient, Step, is_missing
 from mpfjax.moves.propagation.tempered import accepted
 from mpfjax.operations.logarithms import add_gradient, without_gradient
 from mpfjax.operations.matrices import row_sums
@@ -33,8 +33,8 @@ class _Target(NamedTuple):
 
     def __call__(self, states: PyTree) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """log D and log L, separately: with a large constant in L, their sum loses digits of D."""
-        log_likelihood = likelihoods(self.model, self.observation, states)
-        return log_transition(self.model, states, self.parents), log_likelihood
+        log_likelihood = likelihoods(target.model, self.observation, states)
+        return log_transition(target.model, states, self.parents), log_likelihood
 
     def ratio(self, new: tuple[Array, Array], old: tuple[Array, Array]) -> Float[Array, " n"]:
         """log π(x') - log π(x)."""
@@ -54,29 +54,29 @@ class AbstractMetropolis(AbstractMarkovMove):
     `least_step` and 0 and drawn anew each time. The standard deviation is that of new draws from
     D(. | x_{t-1}). Integer parts of the state do not move.
 
-    - `model`: with `log_transition`.
     - `num_steps`: how many steps each particle takes.
     - `least_step`: the smallest s.
-    - `exponent`: β, for a likelihood that enters by powers, as with `Reweight(model, exponent)`.
+    - `exponent`: β, for a likelihood that enters by powers, as with `Reweight(exponent)`.
     - `gradient`: "none" differentiates the draws, "stop" the density of the state after the move,
       as with `gradient` of `Propagate`.
 
-    Raises `ValueError` for a model without `log_transition`, no steps, a least step or an exponent
-    out of range.
+    Raises `ValueError` for no steps, a least step or an exponent out of range, and in a filter of a
+    model without `log_transition`.
     """
 
-    model: AbstractStateSpaceModel
     num_steps: Count = eqx.field(static=True, default=1)
     least_step: InnerShare = eqx.field(static=True, default=0.02)
     exponent: Exponent = eqx.field(static=True, default=1.0)
     gradient: Gradient = eqx.field(static=True, default="none")
 
-    def __check_init__(self) -> None:
-        refuse_marginalised(self.model, type(self).__name__)
-        require(self.model, "log_transition", type(self).__name__)
-
     needs_parents = True
     """the target of x_t is given x_{t-1}."""
+
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a model without `log_transition`."""
+        del num_particles, num_components
+        refuse_marginalised(now.model, type(self).__name__)
+        require(now.model, "log_transition", type(self).__name__)
 
     @abc.abstractmethod
     def propose(
@@ -84,14 +84,14 @@ class AbstractMetropolis(AbstractMarkovMove):
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """A proposal for every particle, and log q(x | x') - log q(x' | x)."""
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Move every particle."""
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
+        """Move every particle, unless y_t is missing."""
+        if is_missing(now):
+            return mixture
         if mixture.parents is None:
             who = f"moves: {type(self).__name__}"
             raise ValueError(f"{who} comes before any propagation: there is no x_t yet")
-        target = _Target(self.model, mixture.parents, observation, self.exponent)
+        target = _Target(now.model, mixture.parents, now.observation, self.exponent)
         states = mixture.particles
         if self.gradient == "stop":
             states = without_gradient(states)
@@ -130,7 +130,7 @@ class RandomWalkMetropolis(AbstractMetropolis):
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """x + s (a - b) / √2, whose reverse step has the same density."""
         rows, back = _as_rows(states)
-        gaps = _gaps(key, self.model, target.parents)
+        gaps = _gaps(key, target.model, target.parents)
         step = length.astype(rows.dtype)[:, None] * gaps / math.sqrt(2)
         return back(rows + step), jnp.zeros_like(length)
 
@@ -150,7 +150,7 @@ class MetropolisAdjustedLangevin(AbstractMetropolis):
         """A step of the Langevin diffusion, and the reverse step's log density relative to it."""
         rows, back = _as_rows(states)
         key_spread, key_noise = split(key, 2)
-        gaps = _gaps(key_spread, self.model, target.parents)
+        gaps = _gaps(key_spread, target.model, target.parents)
         deviations = jnp.sqrt(0.5 * jnp.mean(gaps**2, axis=0))
         unit = length.astype(rows.dtype)[:, None] * deviations[None]
 

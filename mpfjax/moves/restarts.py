@@ -1,29 +1,35 @@
 """Restarts: hypotheses that the state is anywhere where it may begin, at every step."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, InnerShare, shown
-from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.moves.base import AbstractMove, AbstractRegrouping, Regrouped
-from mpfjax.moves.initial import chosen, sample_initial, two_looks
-from mpfjax.operations.logarithms import log_sum_exp
+from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
+from mpfjax.moves.alarm import is_alarmed, over_all_islands, quiet
+from mpfjax.moves.base import (
+    AbstractMove,
+    AbstractRegrouping,
+    AbstractWrapper,
+    Regrouped,
+    Step,
+    is_missing,
+    unless_waiting,
+)
+from mpfjax.moves.initial import chosen, require_propagation, sample_initial, two_looks
+from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.operations.logarithms import log_sum_exp, without_gradient
 from mpfjax.operations.random import split
-from mpfjax.operations.stored import take
 
-SURPRISE = "log_evidence_against_hypotheses"
-# The cumulative sum at which the hypotheses are taken to be wrong, as a log Bayes factor.
-ALARM = 5.0
 # Of the slots for restarts, while nothing speaks against the hypotheses.
 QUIET_PART = 1 / 16
 
 
-class Restart(AbstractMove):
+class Restart(AbstractWrapper):
     """Resample for x_{t-1} ~ (1 - p) δ + p p_0: with probability p the state begins anew.
 
     The state of a robot that is carried away, or of a target that is lost and found, is drawn from
@@ -37,117 +43,114 @@ class Restart(AbstractMove):
     Where the cumulative sum of its logarithm exceeds 5, restarts take all of their share; elsewhere
     a sixteenth of it, so that they cost little.
 
+    The filter's own propagation draws x_t, and weighs it.
+
     - `resample`: the chain's resampling, a `Resample` or `AuxiliaryResample` at every step.
-    - `propagation`: draws x_t, and weighs it: usually the filter's own.
     - `probability`: p.
     - `share`: the most of the slots that restarts take.
     - `num_draws`: K.
 
-    `with_restarts` makes a filter with it. Raises `ValueError` for another resampling or
-    propagation, and for numbers out of their range.
+    `with_restarts` makes a filter with it. Raises `ValueError` for another resampling, for numbers
+    out of their range, and in a filter that has too few particles, or no propagation of each.
     """
 
     resample: Any
-    propagation: Any
     probability: InnerShare = eqx.field(static=True, default=1e-3)
     share: InnerShare = eqx.field(static=True, default=1 / 4)
     num_draws: Count = eqx.field(static=True, default=4)
 
-    resamples = True
-    keeps_parents = False
-    """a draw of x_0 has no parent."""
+    holds = ("resample",)
+    keeps_mass = False
     keeps_families = False
 
     def __check_init__(self) -> None:
-        plain = getattr(self.resample, "resampling", None)
-        fixed = plain is None or plain.ess_threshold < 1 or plain.particles_per_component
-        if fixed:
+        super().__check_init__()
+        plain = plain_resample(self.resample)
+        if plain is None or plain.ess_threshold < 1 or plain.particles_per_component:
             what = "is no Resample of all components at every step, which leaves slots"
             raise ValueError(f"resample: {shown(self.resample)} {what}")
-        if not getattr(self.propagation, "draws_each", False):
-            who = f"propagation: {shown(self.propagation)}"
-            raise ValueError(f"{who} does not draw x_t of each x_(t-1)")
 
-    def map_inner(self, change: Callable[[Any], Any]) -> "Restart":
-        """The same with another resampling and another propagation."""
-        inner = change(self.resample), change(self.propagation)
-        return Restart(*inner, self.probability, self.share, self.num_draws)
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` where there are too few slots, or no propagation of each."""
+        super().check(now, num_particles, num_components)
+        require_propagation(now, "a state begins anew")
+        most, others = self._most_slots(num_particles), num_components - 1
+        if others < 1 or num_particles - most < others:
+            which = f"is less than {most} for restarts and one for each of {others} components"
+            raise ValueError(f"num_particles: {num_particles} {which}")
 
-    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """How much has spoken against the hypotheses: a cumulative sum of log Bayes factors."""
-        del num_components
-        return {SURPRISE: jnp.zeros(())}
+    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
+        """How much has spoken against the hypotheses, beside the memory of the resampling."""
+        return quiet() | super().initial_memory(model, num_components)
 
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
-        """What the resampling would."""
-        return self.resample.would_resample(mixture, observation)
+    def around(self, reference: Any) -> AbstractMove:
+        """Raise a `ValueError`: a trajectory that is kept would have to begin anew."""
+        del reference
+        raise ValueError("filter: restarts cannot keep a trajectory, as Resample and Propagate can")
 
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """The same where y_t is missing, with any draws of x_0."""
-        return self(key, mixture, None)
+    def _most_slots(self, num_particles: int) -> int:
+        return max(1, round(self.share * num_particles))
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Resample, with draws of x_0 that y_t speaks for in the last slots."""
         key_resample, key_drawn, key_look, key_chosen = split(key, 4)
-        n, last = mixture.num_particles, mixture.num_components - 1
-        # The cumulative sum after the step before; bounded, so that it ends when they are right.
-        against = self.evidence_against(mixture, observation, jnp.zeros(()))
-        surprise = jnp.clip(mixture.memory[SURPRISE] + against, 0.0, 2 * ALARM)
-        most = max(1, round(self.share * n))
-        least = max(1, round(QUIET_PART * most))
-        number = jnp.where(surprise > ALARM, most, least).astype(jnp.int32)
-        first = jnp.asarray(mixture.num_usable_slots, jnp.int32) - number
-
-        survivors = self._resampled(key_resample, mixture.replace(usable_slots=first), observation)
-        drawn = sample_initial(key_drawn, self.propagation.model, self.num_draws * most)
-        if observation is None:
-            log_factors = jnp.zeros((2, self.num_draws * most))
+        usable, last = mixture.num_usable_slots, mixture.num_components - 1
+        room = self._most_slots(mixture.num_particles)
+        if mixture.usable_slots is None:
+            most = jnp.asarray(room, jnp.int32)
         else:
-            log_factors = two_looks(key_look, self.propagation, drawn, observation)
-        anew = chosen(key_chosen, drawn, log_factors, most, number=number)
+            most = jnp.maximum(1, jnp.round(self.share * usable)).astype(jnp.int32)
+        least = jnp.maximum(1, jnp.round(QUIET_PART * most)).astype(jnp.int32)
+        number = jnp.where(is_alarmed(mixture), most, least)
 
-        slot = jnp.arange(n, dtype=jnp.int32) - first
-        is_new, rank = (slot >= 0) & (slot < number), jnp.clip(slot, 0, most - 1)
-
-        def pick(new: Array, old: Array) -> Array:
-            return jnp.where(is_new.reshape(-1, *[1] * (old.ndim - 1)), take(new, rank), old)
-
-        log_weights = jnp.log(self.probability) + anew.log_scale + anew.log_weights
-        return survivors.replace(
-            particles=jax.tree.map(pick, anew.particles, survivors.particles),
-            log_weights=pick(log_weights, jnp.log1p(-self.probability) + survivors.log_weights),
-            component_indicators=jnp.where(is_new, last, survivors.component_indicators),
-            ancestor_indices=jnp.where(is_new, -1, survivors.ancestor_indices),
-            usable_slots=mixture.usable_slots,
-            memory=survivors.memory | {SURPRISE: surprise},
+        survivors = self._resampled(
+            key_resample, mixture.replace(usable_slots=usable - number), now
         )
+        drawn = sample_initial(key_drawn, now.model, self.num_draws * room)
+        if is_missing(now):
+            log_factors = jnp.zeros((2, self.num_draws * room))
+        else:
+            log_factors, _ = two_looks(key_look, now, drawn)
+        anew = chosen(key_chosen, drawn, log_factors, room, number=number)
+        anew = anew.replace(
+            component_indicators=jnp.full_like(anew.component_indicators, last),
+            ancestor_indices=no_ancestors(anew),
+        )
+        log_shares = jnp.log(jnp.array([1 - self.probability, self.probability]))
+        joined = survivors.weighed(log_shares[:1]).joined(anew.weighed(log_shares[1:]))
+        # A mixture that waits is of x_0, whose law a restart does not change.
+        return unless_waiting(joined.replace(usable_slots=mixture.usable_slots), mixture)
 
     def _resampled(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step
     ) -> ParticleMixture:
         """The mixture after the resampling, without restarts of the step before as such."""
-        last = mixture.num_components - 1
-        if observation is None:
-            survivors = self.resample.resampling(key, mixture)
+        last, resample = mixture.num_components - 1, self.resample
+        if is_missing(now):
+            # There is nothing to look ahead to, and slots are needed all the same.
+            survivors = plain_resample(resample).resample(key, mixture)  # pyright: ignore
         else:
-            survivors = self.resample(key, mixture, observation)
+            survivors = resample(key, mixture, now)
         # A free label, or that of the lightest component.
-        joined = jnp.argmin(mixture.log_mixture_weights[:last]).astype(jnp.int32)
+        lightest = jnp.argmin(mixture.log_mixture_weights[:last]).astype(jnp.int32)
         labels = survivors.component_indicators
-        return survivors.replace(component_indicators=jnp.where(labels == last, joined, labels))
+        return survivors.replace(component_indicators=jnp.where(labels == last, lightest, labels))
 
     def evidence_against(
-        self, mixture: ParticleMixture, observation: PyTree, increment: Float[Array, ""]
+        self, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
     ) -> Float[Array, ""]:
         """The odds of the draws of x_0 after the step, over p / (1 - p)."""
-        del observation, increment
+        del now, increment
         log_masses = mixture.log_mixture_weights
-        log_odds = log_masses[-1] - log_sum_exp(log_masses[:-1])
+        anew, others = log_masses[-1], log_sum_exp(log_masses[:-1])
+        log_odds = over_all_islands(anew) - over_all_islands(others)
         return log_odds - jnp.log(self.probability / (1 - self.probability))
+
+
+def plain_resample(move: Any) -> Resample | None:
+    """The `Resample` that a move is, or by which it draws; None of any other move."""
+    held = (move, *move.inner) if isinstance(move, Resample | AuxiliaryResample) else ()
+    return next((each for each in held if isinstance(each, Resample)), None)
 
 
 class WatchStart(AbstractMove):
@@ -156,55 +159,62 @@ class WatchStart(AbstractMove):
     The report's `log_evidence_against_start` is log of the mean of p(y_t | x_{t-1}) over the draws,
     less the increment. `with_alarm` makes a filter with it.
 
-    - `propagation`: draws x_t of each draw of x_0, and weighs it: usually the filter's own.
-    - `draws`: of x_0, the same at every step.
+    - `num_draws`: of x_0, the same at every step.
     """
 
-    propagation: Any
-    draws: PyTree
+    num_draws: Count = eqx.field(static=True, default=4096)
 
     weighs = False
     keeps_mass = True
-    keeps_trajectories = True
 
-    def map_inner(self, change: Callable[[Any], Any]) -> "WatchStart":
-        """The same with another propagation."""
-        return WatchStart(change(self.propagation), self.draws)
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` where no move draws x_t of each particle."""
+        del num_particles, num_components
+        require_propagation(now, "draws of x_0 are compared")
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
+    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
+        """How much has spoken against the hypotheses."""
+        del model, num_components
+        return quiet()
+
+    def around(self, reference: Any) -> "WatchStart":
+        """The move itself, which changes nothing."""
+        del reference
+        return self
+
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """The mixture itself."""
-        del key, observation
+        del key, now
         return mixture
 
     def evidence_against(
-        self, mixture: ParticleMixture, observation: PyTree, increment: Float[Array, ""]
+        self, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
     ) -> Float[Array, ""]:
         """log mean p(y_t | x_{t-1}) less the increment; zero where y_t is missing."""
         del mixture
-        if observation is None:
+        if is_missing(now):
             return jnp.zeros_like(increment)
-        anew = self.propagation(jax.random.key(0), single_component(self.draws), observation)
-        return jax.lax.stop_gradient(anew.log_mass - increment)
+        now = without_gradient(now)
+        key_drawn, key_moved = jax.random.split(jax.random.key(0))
+        draws = single_component(sample_initial(key_drawn, now.model, self.num_draws))
+        anew = now.propagation(key_moved, draws, now)  # pyright: ignore[reportOptionalCall]
+        return anew.log_mass - jax.lax.stop_gradient(increment)
 
 
-class RegroupOthers(AbstractRegrouping):
+class RegroupOthers(AbstractWrapper, AbstractRegrouping):
     """A regrouping of all components but the last, whose label is that of restarts."""
 
-    regrouping: Any
+    regrouping: AbstractRegrouping
 
-    def map_inner(self, change: Callable[[Any], Any]) -> "RegroupOthers":
-        """The same of another regrouping."""
-        return RegroupOthers(change(self.regrouping))
+    holds = ("regrouping",)
 
-    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """The checks of the regrouping, of one component less."""
+        self.regrouping.check(now, num_particles, num_components - 1)
+
+    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """That of the regrouping."""
-        return self.regrouping.initial_memory(num_components - 1)
-
-    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
-        """What the regrouping forgets."""
-        return self.regrouping.forget(memory, dead[:-1])
+        return self.regrouping.initial_memory(model, num_components - 1)
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The labels of the others; those of restarts stay."""
@@ -215,5 +225,7 @@ class RegroupOthers(AbstractRegrouping):
             component_indicators=jnp.where(is_last, 0, labels),
             num_components=last,
         )
+        if last == 1:
+            return labels, mixture.memory
         regrouped, memory = self.regrouping.regroup(key, others)
         return jnp.where(is_last, last, regrouped), memory

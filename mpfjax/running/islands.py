@@ -3,6 +3,7 @@
 Where their masses have become uneven, `IslandInteraction` deals the particles anew.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import as_series
-from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.base import AbstractMove, Step, is_missing
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.islands import (
     DEVICE_AXIS,
@@ -103,20 +104,18 @@ def _run_on_one(keys, filter, series, collect):
 
 def _joined(run: FilterRun, whole: bool) -> FilterRun:
     """The run of the whole mixture, from one whose every leaf has a leading axis of islands."""
-    collected = run.collected
     if whole:
-        collected = jax.vmap(_whole_mixture, in_axes=1)(collected)
+        collected = jax.vmap(_whole_mixture, in_axes=1)(run.collected)
     else:
-        collected = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), collected)
+        collected = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), run.collected)
     resampled = jnp.moveaxis(run.resampled, 0, 1)
-    return FilterRun(
-        log_marginal_likelihood=run.log_marginal_likelihood[0],
-        log_likelihood_increments=run.log_likelihood_increments[0],
+    # All else is the same on each island.
+    return dataclasses.replace(
+        jax.tree.map(lambda leaf: leaf[0], run),
         collected=collected,
         initial=_whole_mixture(run.initial),
         final=_whole_mixture(run.final),
         resampled=resampled.reshape(resampled.shape[0], -1),
-        degenerate=run.degenerate[0],
     )
 
 
@@ -176,12 +175,12 @@ class IslandInteraction(AbstractMove):
         return 1 / jnp.sum(softmax(log_masses) ** 2) < self.threshold * num_islands()
 
     def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:
-        """Deal the particles if it is due."""
-        del key, observation
+        """Deal the particles if it is due, unless y_t is missing."""
+        del key
         n, islands = mixture.num_particles, num_islands()
-        if islands == 1:
+        if islands == 1 or is_missing(now):
             return mixture
         if n % islands:
             raise ValueError(f"num_particles: {n} of an island, for {islands} islands alike")

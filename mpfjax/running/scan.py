@@ -12,14 +12,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.chain import BROKEN_DENSITY
 from mpfjax.checks import saying, warn
-from mpfjax.filter import Filter, StepInfo
+from mpfjax.filter import BROKEN_DENSITY, Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import Series
-from mpfjax.moves.restarts import ALARM, SURPRISE
 from mpfjax.operations.islands import num_islands
 from mpfjax.operations.random import split, split_for_run, split_keys
+from mpfjax.report import StepInfo
 
 
 class FilterRun(eqx.Module):
@@ -39,18 +38,9 @@ class FilterRun(eqx.Module):
     """the steps at which every particle had zero likelihood."""
     log_evidence_against_start: Float[Array, " t"] | None = None
     """that of each step's `StepInfo`, and None unless a move of the filter tells it."""
-
-    @property
-    def surprised(self) -> Bool[Array, "*t"] | None:
-        """The steps at which all hypotheses seem wrong; None without that evidence.
-
-        Its cumulative sum, which never falls below zero, is then above 5: a CUSUM (Page 1954).
-        """
-        if self.log_evidence_against_start is None:
-            return None
-        sums = jnp.cumsum(jnp.clip(self.log_evidence_against_start, -50.0, 50.0), axis=-1)
-        lowest = jax.lax.cummin(jnp.minimum(sums, 0.0), axis=sums.ndim - 1)
-        return sums - lowest > ALARM
+    surprised: Bool[Array, " t"] | None = None
+    """the steps at which all hypotheses seem wrong: the cumulative sum of that evidence, which
+    never falls below zero nor rises above 10, is above 5 (a CUSUM, Page 1954); None likewise."""
 
 
 def scan(
@@ -61,7 +51,7 @@ def scan(
     initial: ParticleMixture | None = None,
 ) -> FilterRun:
     """`run_filter` under the caller's jit, its arguments unchecked, from an `initial` mixture."""
-    num_initial, num_moves = 1 + len(filter._initial_moves), len(filter._moves)
+    num_initial, num_moves = 1 + len(filter.initial_moves), len(filter.moves)
     keys_initial, keys = split_for_run(key, num_initial, series.length, num_moves)
 
     def advance(
@@ -94,7 +84,7 @@ def takes_time(collect: Any) -> bool:
 
 def initial_keys(key: Key[Array, ""], filter: Filter) -> Key[Array, " i"]:
     """The keys with which a run with this key draws and moves x_0."""
-    return split(split_keys(key, 2)[0], 1 + len(filter._initial_moves))
+    return split(split_keys(key, 2)[0], 1 + len(filter.initial_moves))
 
 
 def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> ParticleMixture:
@@ -103,36 +93,44 @@ def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> P
     On islands it has the share of one of them in the mass of all.
     """
     log_islands = math.log(num_islands())
-    if not filter.looks_at_first:
+    if not filter.weighs_initially:
         mixture = filter._init(key)
         return mixture.replace(log_weights=mixture.log_weights - log_islands)
     first = jax.tree.map(lambda leaf: leaf[0], series)
     given = filter.with_inputs(first.inputs)
-    look = lambda: given._init(key, first.observations)  # noqa: E731
     if first.present is None:
-        mixture = look()
+        mixture = given._init(key, first.observations)
     else:
-        mixture = jax.lax.cond(first.present, look, lambda: given._init(key))
+        mixture = jax.lax.cond(
+            first.present,
+            lambda: given._init(key, first.observations),
+            lambda: given._init(key),
+        )
     return mixture.replace(log_scale=mixture.log_scale - log_islands)
 
 
-Report = tuple[
-    Float[Array, "*t"], Bool[Array, "*t m"], Bool[Array, "*t"], Float[Array, "*t"] | None
-]
+_KEPT = ("resampled", "degenerate", "log_evidence_against_start", "surprised")
+Report = dict[str, PyTree]
 """What a run keeps of a step's report, or of those of all steps."""
 
 
 def report_of(info: StepInfo) -> Report:
     """The part of a step's report that a run keeps."""
-    of_evidence = info.log_evidence_against_start
-    return info.log_likelihood_increment, info.resampled, info.degenerate, of_evidence
+    kept = {name: getattr(info, name) for name in _KEPT}
+    return kept | {"log_likelihood_increments": info.log_likelihood_increment}
 
 
 def run_of(
     initial: ParticleMixture, final: ParticleMixture, collected: PyTree, reports: Report
 ) -> FilterRun:
     """The `FilterRun` of these steps, whose reports are stacked."""
-    return FilterRun(jnp.sum(reports[0]), reports[0], collected, initial, final, *reports[1:])
+    return FilterRun(
+        log_marginal_likelihood=jnp.sum(reports["log_likelihood_increments"]),
+        collected=collected,
+        initial=initial,
+        final=final,
+        **reports,
+    )
 
 
 def step_or_predict(
@@ -156,7 +154,7 @@ def sound(run: FilterRun) -> FilterRun:
     """The run, or an error where a density of the model was NaN or infinite.
 
     A RuntimeWarning, one for all runs, where no step of a run had any likelihood, and another where
-    what was seen spoke against all hypotheses and no restarts follow.
+    at the end all hypotheses seem wrong.
     """
     increments = run.log_likelihood_increments
     if isinstance(increments, Tracer):
@@ -171,13 +169,12 @@ def sound(run: FilterRun) -> FilterRun:
         said = f"every step with an observation was degenerate{which}: no particle had any"
         said += " likelihood; mpfjax.check_model tries a model out"
         warn(said)
-    surprised = run.surprised
-    # Restarts see to it themselves.
-    if surprised is not None and np.any(surprised) and SURPRISE not in run.final.memory:
-        steps = np.asarray(surprised)
-        which = f" in {steps.any(axis=-1).sum()} of {len(steps)} runs" if steps.ndim > 1 else ""
-        first = int(np.argmax(steps.reshape(-1, steps.shape[-1]).any(axis=0)))
-        said = f"what was seen speaks against all hypotheses{which}, first at index {first} of the"
-        said += " steps: run.surprised; mpfjax.with_restarts lets the state begin anew"
-        warn(said)
+    if run.surprised is not None and np.any(run.surprised[..., -1]):
+        surprised = np.asarray(run.surprised)
+        is_lost = surprised[..., -1]
+        which = f" in {is_lost.sum()} of {is_lost.size} runs" if is_lost.ndim else ""
+        first = int(np.argmax(surprised.reshape(-1, surprised.shape[-1]).any(axis=0)))
+        said = f"at the end, what was observed speaks against all hypotheses{which}, first at index"
+        said += f" {first} of the steps: run.surprised; mpfjax.with_restarts lets the state begin"
+        warn(f"{said} anew")
     return run

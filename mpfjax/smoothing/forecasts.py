@@ -7,11 +7,10 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.chain import give_inputs
 from mpfjax.checks import Count, check_one_each, checked, saying
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import mapped
+from mpfjax.models.base import AbstractStateSpaceModel, mapped, with_inputs
 from mpfjax.models.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
@@ -68,6 +67,18 @@ def forecast(
     )
 
 
+def given(simulate_observation: Any, inputs: PyTree) -> Any:
+    """The function at a step with these inputs, which every model in it receives."""
+
+    def is_model(node: Any) -> bool:
+        return isinstance(node, AbstractStateSpaceModel)
+
+    def give(node: Any) -> Any:
+        return with_inputs(node, inputs) if is_model(node) else node
+
+    return jax.tree.map(give, simulate_observation, is_leaf=is_model)
+
+
 @jit_on_wide_vectors
 def _forecast(key, filter, mixture, inputs, options):
     num_steps, simulate_observation = options
@@ -80,7 +91,7 @@ def _forecast(key, filter, mixture, inputs, options):
         mixture, _ = filter.with_inputs(now)._step(key_step, mixture)
         observations = None
         if simulate_observation is not None:
-            simulate = give_inputs(simulate_observation, filter.model, now)
+            simulate = given(simulate_observation, now)
             with saying("simulate_observation", "called with a key and the particles"):
                 observations = simulate(key_observation, mixture.particles)
             check_one_each(mixture.num_particles, simulate_observation=observations)

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
-from mpfjax.chain import StepInfo, check_keep_parents
 from mpfjax.checks import Checked, Count, CountOrZero, check_one_each, checked, saying
-from mpfjax.filter import Filter
+from mpfjax.filter import Filter, check_keep_parents
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require, with_inputs
 from mpfjax.models.conditionally_linear import refuse_marginalised
@@ -24,6 +23,7 @@ from mpfjax.operations.compiling import (
 from mpfjax.operations.logarithms import as_inexact
 from mpfjax.operations.random import split, split_keys
 from mpfjax.operations.stored import take
+from mpfjax.report import StepInfo
 from mpfjax.running.scan import (
     FilterRun,
     first_mixture,

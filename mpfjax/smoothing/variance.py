@@ -6,13 +6,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Float, Key
 
-from mpfjax.chain import check_keep_parents
 from mpfjax.checks import checked
-from mpfjax.filter import Filter
+from mpfjax.filter import Filter, check_keep_parents
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMove, with_inner
+from mpfjax.moves.base import AbstractMove, Step, all_of
 from mpfjax.moves.eve_indices import (
     EVE_INDICES,
     evidence_variance,
@@ -35,10 +34,10 @@ class _KeepFirstAncestors(AbstractMove):
     keeps_mass = True
 
     def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:
         """The mixture with a memory in which every particle is its own first ancestor."""
-        del key, observation
+        del key, now
         return with_new_eve_indices(mixture)
 
 
@@ -55,7 +54,7 @@ def with_first_ancestors(filter: Filter) -> Filter:
     not independent: a scheme other than "multinomial", or a noise other than "independent".
     """
     check_keep_parents("filter", filter.moves, "with_first_ancestors")
-    for move in with_inner(filter.moves):
+    for move in all_of(filter.moves):
         if move.approximate or not move.keeps_families:
             name = type(move).__name__
             raise ValueError(f"filter: {name} is approximate or draws in a way of its own")

@@ -12,7 +12,7 @@ from mpfjax.checks import Rule, kinds, warn
 from mpfjax.filter import Filter
 from mpfjax.models.observations import Series, as_series, gathered
 from mpfjax.moves.base import AbstractMove
-from mpfjax.proposals import AbstractProposal
+from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.running.scan import FilterRun, scan
 from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, placed, pose
 
@@ -92,7 +92,7 @@ def warn_of_bias(caller: str, problem: Problem) -> None:
     names = [name for name, index in problem.tuned if index not in of_proposals]
     moves = [move for move in _nodes(problem.tree, AbstractMove) if move.biases_score]
     if names and moves:
-        said = f"{caller}: {type(moves[0]).__name__} has no gradient, so that the score of"
+        said = f"{caller}: {type(moves[-1]).__name__} has no gradient, so that the score of"
         said += f' {", ".join(names)} is biased; build the filter with gradient="stop"'
         warn(said, UserWarning)
 

@@ -35,7 +35,7 @@ def side(states):
 
 def in_groups(model):
     groups = [mpfjax.GroupBy(side)]
-    moves = [mpfjax.Resample(), mpfjax.Propagate(model), *groups]
+    moves = [mpfjax.Resample(), mpfjax.Propagate(), *groups]
     return mpfjax.Filter(model, moves, 60, 2, initial_moves=groups)
 
 

@@ -18,7 +18,7 @@ def ahead(model, observation, states, weights):
 
     @eqx.filter_jit
     def look(model, observation, mixture):
-        return PilotLookahead(model).at_step_of(mixture)(observation, mixture.particles)
+        return PilotLookahead().at_step_of(mixture)(observation, mixture.particles)
 
     return np.exp(np.asarray(look(model, observation, mixture), float))
 
@@ -71,6 +71,6 @@ def test_point_sets_bring_it_along_and_independent_noise_does_not(noise):
     model = mpfjax.QuadraticModel()
     move = mpfjax.mixture_particle_filter(model, 20, 2, noise=noise).moves[0]
     assert isinstance(getattr(move, "lookahead", None), PilotLookahead) == (noise == "rqmc")
-    guided = mpfjax.GaussNewtonProposal(model)
+    guided = mpfjax.GaussNewtonProposal()
     filter = mpfjax.mixture_particle_filter(model, 20, 2, noise=noise, proposal=guided)
     assert isinstance(filter.moves[0], mpfjax.Resample)

@@ -54,11 +54,11 @@ class Wide(mpfjax.AbstractProposal):
 
 
 CHAINS = {
-    "plain": Filter(MODEL, [Resample(), Propagate(MODEL)], 100),
-    "guided": Filter(MODEL, [Resample(), Propagate(MODEL, Wide())], 100),
+    "plain": Filter(MODEL, [Resample(), Propagate()], 100),
+    "guided": Filter(MODEL, [Resample(), Propagate(Wide())], 100),
     "rqmc": mpfjax.particle_filter(MODEL, 100, noise="rqmc"),
     "by regime": Filter(
-        MODEL, [Resample(), Propagate(MODEL), GroupBy(lambda states: states[:, 0] > 0)], 100, 2
+        MODEL, [Resample(), Propagate(), GroupBy(lambda states: states[:, 0] > 0)], 100, 2
     ),
 }
 
@@ -144,7 +144,7 @@ def test_chances_and_densities_may_be_functions_and_measurements_trees_of_one_pa
 
 def test_what_needs_a_single_measurement_is_refused():
     for missing, make in (
-        ("observation_mean", lambda: mpfjax.GaussNewtonProposal(MODEL)),
+        ("observation_mean", lambda: guided(mpfjax.GaussNewtonProposal())),
         ("sample_observation", lambda: mpfjax.simulate(KEY, MODEL, 2)),
     ):
         with pytest.raises(ValueError, match=f"ClutteredModel.* {missing}"):

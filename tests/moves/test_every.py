@@ -18,7 +18,7 @@ def indicators(mixture):
 
 
 def runs(*moves, observations=OBSERVATIONS):
-    filter = mpfjax.Filter(MODEL, [Propagate(MODEL), *moves], 40, 3, [KMeans(2, reseed=True)])
+    filter = mpfjax.Filter(MODEL, [Propagate(), *moves], 40, 3, [KMeans(2, reseed=True)])
     return mpfjax.monte_carlo(KEYS, filter, observations, indicators, missing="skip")
 
 

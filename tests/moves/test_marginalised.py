@@ -32,25 +32,25 @@ def own(moves, num_components=1, num_particles=NUM_PARTICLES, initial_moves=()):
 
 FILTERS = {
     "a component for each regime": lambda: own(
-        [Resample(), mpfjax.PropagateMarginalised(MODEL), GroupBy(by_regime)], NUM_REGIMES,
+        [Resample(), mpfjax.PropagateMarginalised(), GroupBy(by_regime)], NUM_REGIMES,
         initial_moves=[GroupBy(by_regime)],
     ),
     "all children, by regime": lambda: own(
-        [PropagateRegimes(MODEL, GroupBy(by_regime))], NUM_REGIMES
+        [PropagateRegimes(GroupBy(by_regime))], NUM_REGIMES
     ),
-    "all children": lambda: own([PropagateRegimes(MODEL)]),
+    "all children": lambda: own([PropagateRegimes()]),
     "all children, in components": lambda: own(
-        [PropagateRegimes(MODEL), KMeans(2)], 2, initial_moves=[KMeans(2, reseed=True)]
+        [PropagateRegimes(), KMeans(2)], 2, initial_moves=[KMeans(2, reseed=True)]
     ),
-    "halves": lambda: own([Resample(), Predict(MODEL), Reweight(MODEL)]),
+    "halves": lambda: own([Resample(), Predict(), Reweight()]),
     "guided halves": lambda: own(
-        [Resample(), Predict(MODEL, RegimeProposal(MODEL)), Reweight(MODEL)]
+        [Resample(), Predict(RegimeProposal()), Reweight()]
     ),
     "fully adapted": lambda: mpfjax.auxiliary_particle_filter(
-        MODEL, NUM_PARTICLES, RegimeProposal(MODEL)
+        MODEL, NUM_PARTICLES, RegimeProposal()
     ),
     "optimal proposal, mpf rqmc": lambda: mpfjax.mixture_particle_filter(
-        MODEL, NUM_PARTICLES, 3, proposal=RegimeProposal(MODEL), noise="rqmc", regroup_every=1
+        MODEL, NUM_PARTICLES, 3, proposal=RegimeProposal(), noise="rqmc", regroup_every=1
     ),
     "families": lambda: mpfjax.with_proposals_per_particle(
         mpfjax.particle_filter(MODEL, NUM_PARTICLES), 3
@@ -268,7 +268,7 @@ def test_no_child_is_kept_twice_and_every_component_keeps_its_mass(name):
 @pytest.mark.exactness
 def test_more_slots_than_children_stay_empty():
     """Copies would have the moments that they copy: with every child, the filter is exact."""
-    filter = own([PropagateRegimes(MODEL)], num_particles=NUM_REGIMES**4)
+    filter = own([PropagateRegimes()], num_particles=NUM_REGIMES**4)
     every = filter.init(KEY)
     one = every.particles._replace(latent=jnp.zeros_like(every.particles.latent))
     first = jnp.arange(filter.num_particles) == 0
@@ -297,9 +297,9 @@ def test_derivatives_of_the_evidence_are_unbiased(kind):
     def run_of(parameters, key):
         model = model_of(parameters)
         if kind == "all children":
-            filter = Filter(model, [PropagateRegimes(model)], 10)
+            filter = Filter(model, [PropagateRegimes()], 10)
         else:
-            proposal = RegimeProposal(model) if "proposal" in kind else None
+            proposal = RegimeProposal() if "proposal" in kind else None
             filter = mpfjax.particle_filter(model, 10, proposal=proposal, gradient="stop")
         run = mpfjax.run_filter(key, filter, OBSERVATIONS[:4], lambda mixture: None)
         return run.log_marginal_likelihood

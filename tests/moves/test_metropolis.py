@@ -29,7 +29,7 @@ class Watch(AbstractMarkovMove):
 def test_parents_follow_their_particles():
     """Through resampling before and after the propagation, they are the states of the ancestors."""
     model = Drift()
-    moves = [Resample(), Propagate(model), Every(2, [Resample("multinomial")]), Watch()]
+    moves = [Resample(), Propagate(), Every(2, [Resample("multinomial")]), Watch()]
     filter = Filter(model, moves, 64, 3, initial_moves=[KMeans(3, reseed=True)])
     run = mpfjax.run_filter(jax.random.key(0), filter, jnp.array([1.0, 2.0]))
     before, after = run.collected.particles[0], run.final

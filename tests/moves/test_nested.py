@@ -38,7 +38,7 @@ LABELS = np.array([0, 0, 1, 1, 1, 2])
 @pytest.mark.parametrize("noise", ["rqmc", "independent"])
 def test_weights_are_means_and_draws_are_kept_by_theirs(noise):
     """E[weight of those that keep a value] is its likelihood, for every value, one of them zero."""
-    move = PropagateNested(Propagate(Marked(LIKELIHOODS), noise=noise), 5)
+    move = PropagateNested(Propagate(noise=noise), 5)
     mixture = make_mixture(np.zeros((6, 2)), np.arange(6.0) / 5, LABELS, 3)
     places = jnp.stack([jnp.zeros(6, jnp.int32), jnp.arange(6, dtype=jnp.int32)], axis=1)
     mixture = mixture.replace(particles=places)
@@ -64,7 +64,7 @@ def test_an_empty_slot_and_a_hopeless_family_stay_without_weight():
 
     @eqx.filter_jit
     def moved(likelihoods):
-        move = PropagateNested(Propagate(Marked(likelihoods)), 3)
+        move = PropagateNested(Propagate(), 3)
         return move(jax.random.key(0), mixture, jnp.float32(0)).log_weights
 
     assert (np.asarray(moved(0 * LIKELIHOODS)) == -np.inf).all()

@@ -98,7 +98,7 @@ def test_without_resampling_weights_are_those_of_the_joint_state(orders):
     labels = rng.integers(0, 2, 40)
     mixture = make_mixture(rng.normal(size=(40, 3, 1)), log_weights, labels, 2)
     between = Resample(ess_threshold=0.0, allocation="equal")
-    moved = apply(Partitioned(REPELLING, orders, resample=between), mixture, OBSERVATIONS[0])
+    moved = apply(Partitioned(orders, resample=between), mixture, OBSERVATIONS[0])
     before = mixture.log_weights[moved.ancestor_indices]
     expected = before + REPELLING.log_likelihood(OBSERVATIONS[0], moved.particles)
     filled = np.asarray(moved.occupied)
@@ -114,7 +114,7 @@ def test_the_object_moved_last_keeps_every_hypothesis():
     mixture = make_mixture(np.zeros((90, 3, 1)), np.zeros(90), np.repeat(np.arange(3), 30), 3)
 
     def moved_last(orders):
-        moved = apply(Partitioned(APART, orders), mixture, OBSERVATIONS[0])
+        moved = apply(Partitioned(orders), mixture, OBSERVATIONS[0])
         particles, labels = np.asarray(moved.particles), np.asarray(moved.component_indicators)
         distinct = [[len(np.unique(particles[labels == c, j])) for j in range(3)] for c in range(3)]
         return [np.flatnonzero(np.array(row) == 30).tolist() for row in distinct]
@@ -125,7 +125,7 @@ def test_the_object_moved_last_keeps_every_hypothesis():
 
 
 def test_random_orders_are_all_drawn():
-    move = Partitioned(APART, "random")
+    move = Partitioned("random")
     orders = jax.vmap(lambda key: move._orders(key, 2))(jax.random.split(KEY, 3000))
     kinds, counts = np.unique(np.asarray(orders).reshape(-1, 3), axis=0, return_counts=True)
     assert len(kinds) == 6
@@ -146,7 +146,7 @@ def of_three_places(reassembly):
     labels = np.repeat(np.arange(3), 10)
     states = np.array([5.0, -5.0, 4.0])[labels][:, None] * np.ones((1, 2))
     mixture = make_mixture(states, 0.1 * np.arange(30), labels, 3)
-    return Partitioned(model, "circular", reassembly=reassembly), mixture
+    return Partitioned("circular", reassembly=reassembly), mixture
 
 
 @pytest.mark.exactness

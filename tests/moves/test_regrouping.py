@@ -237,14 +237,14 @@ class TestGroupBy:
         weighed = make_mixture(np.zeros(3), np.zeros(3), [0, 0, 0], 2)
         with pytest.raises(RuntimeError, match=r"GroupBy: function gave a label outside \[0, "):
             jax.block_until_ready(group(KEY, weighed))
-        moves = [Resample(), Propagate(MODEL), GroupBy(lambda states: 2 * side(states))]
+        moves = [Resample(), Propagate(), GroupBy(lambda states: 2 * side(states))]
         with pytest.raises(RuntimeError, match="GroupBy"):
             mpfjax.run_filter(KEY, Filter(MODEL, moves, 20, 2), jnp.ones(3))
 
     @pytest.mark.parametrize("label", [side, lambda states: states > 0])
     def test_each_label_keeps_its_particles_however_improbable_it_is(self, label):
         """Observations of x² say nothing of the sign; a plain filter of 20 loses one."""
-        moves = [Resample(), Propagate(MODEL), GroupBy(label)]
+        moves = [Resample(), Propagate(), GroupBy(label)]
         kept = Filter(MODEL, moves, 20, 2, initial_moves=[GroupBy(label)])
         counts = mpfjax.run_filter(KEY, kept, jnp.full(100, 3.0), lambda m: m.component_counts)
         assert int(counts.collected.min()) == 10

@@ -17,7 +17,7 @@ GRID = jnp.linspace(-8.0, 8.0, 4001)
 
 
 def in_stages(model, num_particles, **options):
-    moves = [Resample(), PropagateTempered(model, **options)]
+    moves = [Resample(), PropagateTempered(**options)]
     return mpfjax.Filter(model, moves, num_particles)
 
 

@@ -24,7 +24,7 @@ def chain(*moves, n, m):
 CASES = {
     "guided, eager mixture, systematic": (
         chain(
-            Resample(), Propagate(QUADRATIC, mpfjax.GaussNewtonProposal(QUADRATIC, 2)), *EAGER,
+            Resample(), Propagate(mpfjax.GaussNewtonProposal(2)), *EAGER,
             n=8, m=3,
         ),
         True,
@@ -32,19 +32,19 @@ CASES = {
     "many components, sorted, of fixed number": (
         chain(
             Resample("stratified", particles_per_component=2, sort_by=lambda x: -x),
-            Predict(QUADRATIC), Reweight(QUADRATIC), RandomPartition(4), n=11, m=5,
+            Predict(), Reweight(), RandomPartition(4), n=11, m=5,
         ),
         False,
     ),
     "looking ahead, adaptive": (
         chain(
             mpfjax.AuxiliaryResample(Resample("stratified", 0.7), lambda y, x: -((y - x**2) ** 2)),
-            Propagate(QUADRATIC), *EAGER, n=8, m=3,
+            Propagate(), *EAGER, n=8, m=3,
         ),
         True,
     ),
     "resampled every second step": (
-        chain(mpfjax.Every(2, [Resample("ssp"), KMeans(2)]), Propagate(QUADRATIC), n=8, m=3),
+        chain(mpfjax.Every(2, [Resample("ssp"), KMeans(2)]), Propagate(), n=8, m=3),
         True,
     ),
 }  # fmt: skip

@@ -63,7 +63,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_regimes_and_moments_are_those_of_all_sequences(case):
     model, observations, centre = CASES[case]
-    filter = Filter(model, [PropagateRegimes(model)], 200)
+    filter = Filter(model, [PropagateRegimes()], 200)
     found = smoothed(filter, observations)
     exact = switching_filter(MODEL if centre else model, observations - centre)
     latent = np.asarray(found.latent)

@@ -33,7 +33,7 @@ RANDOM_LABELS = RandomLabels()
 
 def labelled(model, n, ess_threshold=1.0, regrouping=RANDOM_LABELS, m=3):
     """Components, of random members if nothing else, which are resampled apart."""
-    moves = [Resample("multinomial", ess_threshold), Propagate(model), regrouping]
+    moves = [Resample("multinomial", ess_threshold), Propagate(), regrouping]
     return Filter(model, moves, n, m, initial_moves=[KMeans(3, reseed=True)])
 
 

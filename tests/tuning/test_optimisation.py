@@ -232,4 +232,4 @@ class TestBias:
             learning = mpfjax.particle_filter(ScalarLinear(), 16, proposal=proposal())
             self.warn(learning, WEIGHTS)
             self.warn(mpfjax.particle_filter(ScalarLinear(), 16, ess_threshold=0.0))
-            self.warn(mpfjax.Filter(ScalarLinear(), [mpfjax.Propagate(ScalarLinear())], 16))
+            self.warn(mpfjax.Filter(ScalarLinear(), [mpfjax.Propagate()], 16))

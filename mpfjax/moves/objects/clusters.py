@@ -1,6 +1,6 @@
 """Clusters of objects: particle filters of their own that merge where objects meet."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -10,11 +10,13 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, no_ancestors
 from mpfjax.models.base import require
+from mpfjax.moves.base import Step, is_missing
 from mpfjax.moves.objects.coupling import coupled, recombined, rotated, scores, together
 from mpfjax.moves.objects.independent import (
     AbstractPropagationByObject,
     drawn_rows,
     moved_objects,
+    predicted,
     rows_of_each,
 )
 from mpfjax.moves.regrouping.merge import lowest_connected
@@ -87,57 +89,62 @@ class PropagateInClusters(AbstractPropagationByObject):
     start: Literal["apart", "together"] = eqx.field(static=True, default="apart")
     split_after: Count | None = eqx.field(static=True, default=None)
 
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        if self._may_be_joint:
-            require(self.model.object_model, "log_transition", "PropagateInClusters")
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a model of one object, or without the density it needs."""
+        super().check(now, num_particles, num_components)
+        model: Any = now.model
+        if self._may_be_joint(model):
+            require(model.object_model, "log_transition", "PropagateInClusters")
 
     @property
     def approximate(self) -> bool:
         """Whether clusters are split again."""
         return self.split_after is not None
 
-    @property
-    def _may_be_joint(self) -> bool:
+    def _may_be_joint(self, model: Any) -> bool:
         """Whether there can ever be a cluster of several objects."""
-        joins = self.model.interaction is not None or self.start == "together"
-        return joins and self.model.num_objects > 1
+        joins = model.interaction is not None or self.start == "together"
+        return joins and model.num_objects > 1
 
-    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """The clusters' labels, and the steps since the last contact of each two objects."""
         del num_components
-        num_objects = self.model.num_objects
+        num_objects = model.num_objects
         labels = jnp.arange(num_objects, dtype=jnp.int32)
         if self.start == "together":
             labels = jnp.zeros_like(labels)
         steps_apart = jnp.zeros((num_objects, num_objects), jnp.int32)
         return {"clusters": {"labels": labels, "steps_apart": steps_apart}}
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Merge the clusters that meet, then advance the filter of every cluster by one step."""
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
+        """Merge the clusters that meet, then advance the filter of every cluster by one step.
+
+        Where y_t is missing, all objects are predicted, and clusters stay.
+        """
+        model: Any = now.model
+        if is_missing(now):
+            return predicted(key, mixture, model)
         require_equal_rows(mixture, "PropagateInClusters")
-        num_objects = self.model.num_objects
+        num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects + 2)
         keys_objects, keys_rows = keys[:num_objects], keys[num_objects : 2 * num_objects]
         key_inside, key_shift = keys[2 * num_objects :]
         particles, memory = mixture.particles, mixture.memory["clusters"]
-        points, log_likelihoods = moved_objects(self.model, keys_objects, particles, observation)
+        points, log_likelihoods = moved_objects(model, keys_objects, particles, now.observation)
         common = jax.vmap(finite_max)(log_likelihoods)
         log_likelihoods = log_likelihoods - common[:, None]
-        if self._may_be_joint:
-            memory = self._regrouped(points, memory)
+        if self._may_be_joint(model):
+            memory = self._regrouped(model, points, memory)
             particles, log_growth = self._updated(
-                (keys_rows, key_inside), particles, points, log_likelihoods, memory["labels"]
+                model, (keys_rows, key_inside), particles, points, log_likelihoods, memory["labels"]
             )
         else:
             rows, log_growth = self._resampled(keys_rows, memory["labels"], log_likelihoods)
             particles = rows_of_each(points, rows)
         # Row i is then a draw of the product of the clusters: any row of one cluster meets any row
         # of another with the same probability.
-        keys_shift = take(split(key_shift, self.model.num_objects), memory["labels"])
+        keys_shift = take(split(key_shift, num_objects), memory["labels"])
         places = jnp.arange(mixture.num_particles, dtype=jnp.int32)
         particles = rows_of_each(particles, jax.vmap(rotated, (0, None))(keys_shift, places))
         moved = mixture.replace(
@@ -146,14 +153,15 @@ class PropagateInClusters(AbstractPropagationByObject):
             memory=mixture.memory | {"clusters": memory},
         ).weighed(log_growth[None], jnp.sum(common)[None])
 
-        def predicted() -> ParticleMixture:
+        def impossible() -> ParticleMixture:
             nothing = jnp.full((1,), -jnp.inf, mixture.log_weights.dtype)
-            return self.predict(key, mixture).weighed(nothing)
+            return predicted(key, mixture, model).weighed(nothing)
 
-        return jax.lax.cond(log_growth == -jnp.inf, predicted, lambda: moved)
+        return jax.lax.cond(log_growth == -jnp.inf, impossible, lambda: moved)
 
     def _updated(
         self,
+        model: Any,
         keys: tuple,
         particles: PyTree,
         points: PyTree,
@@ -165,14 +173,14 @@ class PropagateInClusters(AbstractPropagationByObject):
         key_cross, key_last = split(key_inside, 2)
         together_with = together(labels)
         alone = jnp.sum(together_with, axis=1) == 1
-        log_totals, log_sums = scores(self.model, particles, points, log_likelihoods, alone)
+        log_totals, log_sums = scores(model, particles, points, log_likelihoods, alone)
         log_scores = jnp.sum(jnp.where(together_with[:, :, None], log_sums[None], 0.0), axis=1)
         rows, log_growth = self._resampled(keys_rows, labels, log_scores)
 
         def cross() -> tuple[PyTree, Float[Array, ""]]:
             log_point_weights = log_likelihoods - log_totals
             tables = rows, log_point_weights, log_sums, together_with
-            chosen, log_weights = recombined(self.model, key_cross, particles, points, *tables)
+            chosen, log_weights = recombined(model, key_cross, particles, points, *tables)
             keys_last = split(key_last, len(labels))
             last, log_gain = self._resampled(keys_last, labels, log_weights)
             # Without this, rounding could redraw equal weights.
@@ -186,9 +194,9 @@ class PropagateInClusters(AbstractPropagationByObject):
         particles, log_gain = jax.lax.cond(jnp.all(alone), stay, cross)
         return particles, log_growth + log_gain
 
-    def _regrouped(self, points: PyTree, memory: dict[str, Array]) -> dict[str, Array]:
+    def _regrouped(self, model: Any, points: PyTree, memory: dict[str, Array]) -> dict[str, Array]:
         """The clusters of the objects whose predicted points are given."""
-        meets = coupled(self.model, points, memory["labels"], self.split_after is not None)
+        meets = coupled(model, points, memory["labels"], self.split_after is not None)
         links, steps_apart = together(memory["labels"]), memory["steps_apart"]
         if self.split_after is not None:
             steps_apart = jnp.where(meets, 0, steps_apart + 1)

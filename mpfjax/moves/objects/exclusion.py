@@ -2,11 +2,11 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import Positive
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.base import AbstractPropagation, Step, is_missing
 from mpfjax.moves.regrouping.features import ByFeatures, summarise
 
 
@@ -53,12 +53,10 @@ class Exclusion(AbstractExclusion, ByFeatures):
     strength: Positive = eqx.field(static=True, default=10.0)
     radius: Positive = eqx.field(static=True, default=0.5)
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Lower the weight of every particle by its nearness to the means of other components."""
-        del key, observation
-        if mixture.num_components == 1:
+        del key
+        if mixture.num_components == 1 or is_missing(now):
             return mixture
         features, own = self.features_of(mixture), mixture.component_indicators
         weights = mixture.occupied.astype(features.dtype)

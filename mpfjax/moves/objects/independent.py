@@ -1,13 +1,17 @@
 """Independent objects: a small particle filter for each, in one mixture."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from mpfjax.checks import check
 from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
+from mpfjax.models.base import model_name
 from mpfjax.models.multi_object import MultiObjectModel
-from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.base import AbstractPropagation, Step, is_missing
 from mpfjax.moves.resampling.allocation import require_equal_rows
 from mpfjax.moves.resampling.resample import Resample, Scheme
 from mpfjax.operations.logarithms import default_float
@@ -18,15 +22,15 @@ from mpfjax.operations.stored import take
 class AbstractPropagationByObject(AbstractPropagation):
     """A propagation in which every object of a particle has a parent of its own."""
 
-    model: MultiObjectModel
     scheme: Scheme = eqx.field(static=True, default="systematic", kw_only=True)
 
     keeps_parents = False
     biases_score = True
 
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Draw x_t ~ D(. | x_{t-1}) of all objects, and leave all else."""
-        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a model of one object."""
+        del num_particles, num_components
+        check(MultiObjectModel, model=now.model)
 
 
 class PropagateIndependently(AbstractPropagationByObject):
@@ -39,26 +43,36 @@ class PropagateIndependently(AbstractPropagationByObject):
     -1 for its index.
 
     The move needs particles of equal weight, as x_0 has and as it returns them; the chain needs no
-    other resampling. It ignores an interaction of the model, and `approximate` is then true.
-    Raises `ValueError` for a mixture of several components, a model of one object, and an unknown
-    scheme.
+    other resampling. It refuses a model with an interaction, unless `ignores_interaction`, which is
+    `approximate`. Raises `ValueError` for a mixture of several components, a model of one object,
+    and an unknown scheme.
     """
+
+    ignores_interaction: bool = eqx.field(static=True, default=False, kw_only=True)
 
     @property
     def approximate(self) -> bool:
-        """Whether the model has an interaction, which this move ignores."""
-        return self.model.interaction is not None
+        """Whether it may ignore an interaction of the model."""
+        return self.ignores_interaction
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """One step of every object's filter."""
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a model of one object, or with an interaction."""
+        super().check(now, num_particles, num_components)
+        if now.model.interaction is not None and not self.ignores_interaction:  # pyright: ignore
+            what = "has an interaction, which PropagateIndependently ignores; say so"
+            raise ValueError(f"ignores_interaction: {model_name(now.model)} {what}")
+
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
+        """One step of every object's filter; where y_t is missing, a prediction."""
+        model: Any = now.model
+        if is_missing(now):
+            return predicted(key, mixture, model)
         require_equal_rows(mixture, "PropagateIndependently")
-        num_objects = self.model.num_objects
+        num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects)
         points, log_likelihoods = moved_objects(
-            self.model, keys[:num_objects], mixture.particles, observation
+            model, keys[:num_objects], mixture.particles, now.observation
         )
         rows, log_growths = drawn_rows(self.scheme, keys[num_objects:], log_likelihoods)
         # An object whose particles all have zero likelihood moves by its dynamics alone.
@@ -68,6 +82,11 @@ class PropagateIndependently(AbstractPropagationByObject):
             particles=rows_of_each(points, rows), ancestor_indices=no_ancestors(mixture)
         )
         return moved.weighed(jnp.sum(log_growths)[None])
+
+
+def predicted(key: Key[Array, ""], mixture: ParticleMixture, model: Any) -> ParticleMixture:
+    """Draws of x_t ~ D(. | x_{t-1}) of all objects, and all else as it was."""
+    return mixture.replace(particles=model.sample_transition(key, mixture.particles))
 
 
 def moved_objects(
@@ -92,7 +111,7 @@ def drawn_rows(
 
     def draw(key: Key[Array, ""], log_weights: Float[Array, " n"]) -> tuple:
         cloud = single_component(log_weights).weighed(log_weights)
-        return resample(key, cloud).ancestor_indices, cloud.log_mass
+        return resample.resample(key, cloud).ancestor_indices, cloud.log_mass
 
     return jax.vmap(draw)(keys, log_weights)
 

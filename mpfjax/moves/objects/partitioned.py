@@ -1,6 +1,6 @@
 """Partitioned sampling: one object after the other, with weighted resampling in between."""
 
-from collections.abc import Sequence
+import functools
 from typing import Any, Literal
 
 import equinox as eqx
@@ -10,10 +10,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import checked, shown, to_rows
+from mpfjax.checks import check, shown, to_rows
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.multi_object import MultiObjectModel
-from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.base import AbstractPropagation, AbstractWrapper, Step, is_missing
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.logarithms import add_gradient, log_sum_exp
@@ -24,7 +24,7 @@ from mpfjax.operations.stored import cond_if_any, take
 Reassembly = Literal["evidence", "prior"]
 
 
-class Partitioned(AbstractPropagation):
+class Partitioned(AbstractPropagation, AbstractWrapper):
     """Propagate one object after the other, resampling after each but the last.
 
     Smith and Gatica-Perez (2004), section 3: object j moves by its dynamics, the particles are
@@ -39,8 +39,8 @@ class Partitioned(AbstractPropagation):
       order for each component; "circular", where component c starts with object c, then c + 1, and
       so on in a circle; or "random", a new order for each component at every step. None is 0, ...,
       J-1.
-    - `resample`: the resampling after each object; None is systematic, at every object, with equal
-      shares of the slots. With its gradient "stop" the objects' draws are constants too, and
+    - `resample`: the resampling after each object; by default systematic, at every object, with
+      equal shares of the slots. With its gradient "stop" the objects' draws are constants too, and
       derivatives pass through their densities, as in `Propagate`.
     - `reassembly`: the masses of the components afterwards (section 4 and eq. 5). "evidence"
       multiplies each mass by the component's evidence, eq. 4 of Vermaak et al. (2003). "prior" is
@@ -51,33 +51,26 @@ class Partitioned(AbstractPropagation):
     A component dies if an object leaves it without weight. The others share its slots and, with
     "prior", its mass. If all weight is lost, the particles move by their dynamics alone.
 
-    Raises `ValueError` for an order that is no permutation of the objects, a number of orders other
-    than one or the number of components, and an unknown reassembly.
+    Raises `ValueError` for orders that are no permutations, and an unknown reassembly; in a filter,
+    for a model of one object, an order that is no permutation of its objects, and a number of
+    orders other than one or the number of components.
     """
 
-    model: MultiObjectModel
-    orders: Int[Array, "orders objects"] | None
-    rule: str | None = eqx.field(static=True)
-    resample: Resample
-    reassembly: Reassembly = eqx.field(static=True)
+    orders: Any = eqx.field(converter=lambda orders: as_orders(orders), default=None)
+    resample: Resample = eqx.field(default=Resample(allocation="equal"), kw_only=True)
+    reassembly: Reassembly = eqx.field(static=True, default="evidence", kw_only=True)
 
-    @checked
-    def __init__(
-        self,
-        model: MultiObjectModel,
-        orders: str | Sequence[int] | Sequence[Sequence[int]] | Array | np.ndarray | None = None,
-        *,
-        resample: Resample | None = None,
-        reassembly: Reassembly = "evidence",
-    ) -> None:
-        if isinstance(orders, str):
-            if orders not in ("circular", "random"):
-                raise ValueError(f"orders: {orders!r} is neither 'circular' nor 'random'")
-            self.rule, self.orders = orders, None
-        else:
-            self.rule, self.orders = None, check_orders(orders, model.num_objects)
-        self.model, self.reassembly = model, reassembly
-        self.resample = Resample(allocation="equal") if resample is None else resample
+    holds = ("resample",)
+
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for orders that do not fit the model's objects or components."""
+        super().check(now, num_particles, num_components)
+        check(MultiObjectModel, model=now.model)
+        num_objects: int = now.model.num_objects  # pyright: ignore[reportAttributeAccessIssue]
+        if isinstance(self.orders, Array) and self.orders.shape[1] != num_objects:
+            what = f"no permutation of the objects 0 to {num_objects - 1}"
+            raise ValueError(f"orders: {shown(self.orders)} is {what}")
+        self._orders(jax.random.key(0), num_objects, num_components)
 
     @property
     def approximate(self) -> bool:
@@ -88,22 +81,25 @@ class Partitioned(AbstractPropagation):
     def _stops_draws(self) -> bool:
         return self.resample.gradient == "stop"
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate and weigh the objects of every particle in its component's order."""
-        num_objects = self.model.num_objects
+        model: Any = now.model
+        gradient = "stop" if self._stops_draws else "none"
+        if is_missing(now):
+            return predict(key, model, mixture, gradient)
+        num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects + 1)
-        orders = self._orders(keys[-1], mixture.num_components)
-        seen = self.model.prepare_observation(observation)
+        orders = self._orders(keys[-1], num_objects, mixture.num_components)
+        seen = model.prepare_observation(now.observation)
 
         def stage(carry: tuple, inputs: tuple) -> tuple[tuple, None]:
             mixture, broken = carry
             rank, key_object, key_resample = inputs
-            redrawn = lambda: self.resample(key_resample, mixture)  # noqa: E731
-            mixture = jax.lax.cond(rank > 0, redrawn, lambda: mixture)
-            mixture, fault = self._advance(key_object, mixture, seen, orders, rank)
+            mixture = jax.lax.cond(
+                rank > 0, lambda: self.resample.resample(key_resample, mixture), lambda: mixture
+            )
+            mixture, fault = self._advance(model, key_object, mixture, seen, orders, rank)
             return (mixture, broken | fault), None
 
         ranks = jnp.arange(num_objects, dtype=jnp.int32)
@@ -118,17 +114,14 @@ class Partitioned(AbstractPropagation):
         def predicted() -> ParticleMixture:
             # Without weights: the step is then one of zero likelihood.
             nothing = jnp.full_like(mixture.log_weights, -jnp.inf)
-            unseen = self.predict(key, mixture).replace(log_weights=nothing)
+            unseen = predict(key, model, mixture, gradient).replace(log_weights=nothing)
             return jax.tree.map(lambda new, old: jnp.where(lost, new, old), unseen, moved)
 
         return cond_if_any(lost, predicted, lambda: moved)
 
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Draw x_t ~ D(. | x_{t-1}) of all objects and leave the weights."""
-        return predict(key, self.model, mixture, "stop" if self._stops_draws else "none")
-
     def _advance(
         self,
+        model: Any,
         key: Key[Array, ""],
         mixture: ParticleMixture,
         seen: PyTree,
@@ -136,7 +129,7 @@ class Partitioned(AbstractPropagation):
         rank: Int[Array, ""],
     ) -> tuple[ParticleMixture, Bool[Array, ""]]:
         """Move each particle's object of this rank; also whether a density was broken."""
-        model, particles = self.model, mixture.particles
+        particles = mixture.particles
         objects = _of_particles(orders[:, rank], mixture)
         previous = model.object_states(particles, objects)
         states = model.sample_object_transition(key, previous, objects)
@@ -164,19 +157,20 @@ class Partitioned(AbstractPropagation):
         moved = moved.replace(particles=model.replace_object(particles, objects, states))
         return moved, jnp.any(~(moved.log_weights < jnp.inf))
 
-    def _orders(self, key: Key[Array, ""], num_components: int) -> Int[Array, "m objects"]:
+    def _orders(
+        self, key: Key[Array, ""], num_objects: int, num_components: int
+    ) -> Int[Array, "m objects"]:
         """The order of the objects in each component."""
-        num_objects = self.model.num_objects
-        if self.rule == "random":
+        if isinstance(self.orders, str):
+            if self.orders == "circular":
+                return jnp.asarray(circular_orders(num_components, num_objects))
             keys = split(key, num_components)
-            shuffle = lambda key: jax.random.permutation(key, num_objects)  # noqa: E731
-            return jax.vmap(shuffle)(keys).astype(jnp.int32)
-        if self.rule == "circular":
-            return jnp.asarray(circular_orders(num_components, num_objects))
-        assert self.orders is not None
-        if self.orders.shape[0] not in (1, num_components):
-            raise ValueError(f"orders: {len(self.orders)} of them, for {num_components} components")
-        return jnp.broadcast_to(self.orders, (num_components, num_objects))
+            draw = functools.partial(jax.random.permutation, x=num_objects)
+            return jax.vmap(draw)(keys).astype(jnp.int32)
+        orders = np.arange(num_objects)[None] if self.orders is None else self.orders
+        if orders.shape[0] not in (1, num_components):
+            raise ValueError(f"orders: {len(orders)} of them, for {num_components} components")
+        return jnp.broadcast_to(orders, (num_components, num_objects)).astype(jnp.int32)
 
 
 def circular_orders(num_orders: int, num_objects: int) -> Int[np.ndarray, "orders objects"]:
@@ -185,15 +179,18 @@ def circular_orders(num_orders: int, num_objects: int) -> Int[np.ndarray, "order
     return (shifts % num_objects).astype(np.int32)
 
 
-def check_orders(orders: Any, num_objects: int) -> Int[Array, "c objects"]:
-    """One order a row; raises `ValueError` for one that is no permutation of the objects."""
+def as_orders(orders: Any) -> Any:
+    """One order a row, or the name of a rule; a `ValueError` for one that is no permutation."""
+    if isinstance(orders, str) and orders not in ("circular", "random"):
+        raise ValueError(f"orders: {orders!r} is neither 'circular' nor 'random'")
+    if orders is None or isinstance(orders, str):
+        return orders
     if isinstance(orders, Tracer):
         return jnp.atleast_2d(orders).astype(jnp.int32)
-    table = to_rows(num_objects, "orders", range(num_objects) if orders is None else orders)
-    is_order = np.sort(table, axis=1) == np.arange(num_objects)[None]
-    if not is_order.size or not is_order.all():
-        what = f"no permutation of the objects 0 to {num_objects - 1}"
-        raise ValueError(f"orders: {shown(orders)} is {what}")
+    num_objects = np.shape(orders)[-1] if np.ndim(orders) else 0
+    table = to_rows(num_objects, "orders", orders)
+    if not table.size or not (np.sort(table, axis=1) == np.arange(num_objects)[None]).all():
+        raise ValueError(f"orders: {shown(orders)} is no permutation of objects from 0 on")
     return jnp.asarray(table, jnp.int32)
 
 

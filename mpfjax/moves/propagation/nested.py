@@ -5,19 +5,18 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import draw_family_noise, noise_dtype
-from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.base import AbstractPropagationOfEach, AbstractWrapper, Step, is_missing
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.operations.random import split, uniform
 from mpfjax.operations.stored import take
 
 
-class PropagateNested(AbstractPropagation):
+class PropagateNested(AbstractPropagationOfEach, AbstractWrapper):
     """Draw K of x_t for each particle, and keep one by its weight.
 
     Draw x_t^ik of particle i has the factor g_ik = L D / q. The particle is weighed by the mean of
@@ -39,25 +38,22 @@ class PropagateNested(AbstractPropagation):
     propagate: Propagate
     num_draws: Count = eqx.field(static=True, default=4)
 
-    draws_each = True
-    """each particle moves without a look at the others."""
+    holds = ("propagate",)
+    biases_score = True
+    """a derivative does not see which draw is kept."""
 
     def __check_init__(self) -> None:
         super().__check_init__()
         if self.propagate.gradient == "stop":
             raise ValueError("propagate: gradient 'stop' does not see which draw is kept")
 
-    @property
-    def model(self) -> AbstractStateSpaceModel:
-        """That of the propagation."""
-        return self.propagate.model
-
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
+        if is_missing(now):
+            # Without an observation all draws of a particle have the same weight.
+            return self.propagate(key, mixture, now)
         n, k = mixture.num_particles, self.num_draws
-        families, shares = self._drawn(key, mixture, observation)
+        families, shares = self._drawn(key, mixture, now)
         log_weights = families.log_weights.reshape(n, k)
         largest = jnp.max(log_weights, axis=1, keepdims=True)
         largest = jnp.where(largest > -jnp.inf, largest, 0.0)
@@ -73,12 +69,8 @@ class PropagateNested(AbstractPropagation):
             log_scale=families.log_scale,
         )
 
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """One draw of x_t for each particle: without an observation all have the same weight."""
-        return self.propagate.predict(key, mixture)
-
     def _drawn(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step
     ) -> tuple[ParticleMixture, Float[Array, " n"]]:
         """The weighed mixture of all draws, and the uniform numbers by which draws are selected."""
         n, k, propagate = mixture.num_particles, self.num_draws, self.propagate
@@ -87,10 +79,10 @@ class PropagateNested(AbstractPropagation):
         if propagate.noise == "independent":
             key_draws, key_kept = split(key, 2)
             shares = uniform(key_kept, (n,), mixture.log_weights.dtype)
-            return propagate(key_draws, repeated, observation), shares
-        shape, dtype = (n, propagate.noise_dimension(mixture)), noise_dtype(mixture.particles)
+            return propagate(key_draws, repeated, now), shares
+        shape, dtype = (n, propagate.noise_dimension(mixture, now)), noise_dtype(mixture.particles)
         noise, shares = draw_family_noise(
             key, shape, k, dtype,
             mixture.component_indicators, mixture.num_components, not mixture.in_order,
         )  # fmt: skip
-        return propagate.from_noise(noise, repeated, observation), shares
+        return propagate.from_noise(noise, repeated, now), shares

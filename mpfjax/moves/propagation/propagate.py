@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Exponent
+from mpfjax.checks import Exponent, check
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -31,13 +31,115 @@ from mpfjax.models.steps import (
     noise_dimension,
     seen,
 )
-from mpfjax.moves.base import AbstractPropagation, Gradient
+from mpfjax.moves.base import (
+    AbstractPropagation,
+    AbstractPropagationOfEach,
+    Gradient,
+    Step,
+    is_missing,
+)
 from mpfjax.moves.conditional import ConditionalPropagation, Reference
+from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.operations.logarithms import add_gradient, finite_max, without_gradient
-from mpfjax.proposals import AbstractProposal
 
 
-class Propagate(AbstractPropagation):
+class _Propagation(AbstractPropagation):
+    """x_t drawn by the model's own law or a proposal, and what it weighs."""
+
+    proposal: AbstractProposal | None = None
+    gradient: Gradient = eqx.field(static=True, default="none")
+    noise: Noise = eqx.field(static=True, default="independent")
+
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a model that lacks what the arguments need."""
+        del num_particles, num_components
+        model, proposal, needs_noise = now.model, self.proposal, self.noise != "independent"
+        if proposal is not None:
+            proposal.check(now)
+        # The mixed form has the law of z_t and its noise whatever the model's methods are.
+        has_law = is_mixed(model)
+        if not has_law and (self.gradient == "stop" or proposal is not None):
+            require(model, "log_transition", "gradient='stop' or a proposal")
+        if needs_noise and proposal is not None:
+            require(proposal, "propose_from_noise", f"noise={self.noise!r}", "proposal")
+        elif needs_noise and not has_law:
+            require_noise(model, f"noise={self.noise!r}")
+
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
+        """Propagate every particle and weigh it by y_t; without it, by the model's own law."""
+        if is_missing(now):
+            return self.predicted(key, mixture, now)
+        if self.noise != "independent":
+            dimension = self.noise_dimension(mixture, now)
+            noise = noise_of_slots(self.noise, key, dimension, mixture)
+            return self.from_noise(noise, mixture, now)
+        if self.proposal is None:
+            return self.weighed(self.predicted(key, mixture, now), now)
+        return self._proposed(self.proposal.propose(key, now, mixture.particles), mixture, now)
+
+    def from_noise(
+        self, noise: Float[Array, "n k"], mixture: ParticleMixture, now: Step
+    ) -> ParticleMixture:
+        """The same with x_t made of this noise, a row for each slot."""
+        if self.proposal is None:
+            draws = made_of(now.model, noise, mixture.particles)
+            return self.weighed(_moved(draws, now.model, mixture, self.gradient), now)
+        proposal: Any = self.proposal
+        return self._proposed(
+            proposal.propose_from_noise(noise, now, mixture.particles), mixture, now
+        )
+
+    def noise_dimension(self, mixture: ParticleMixture, now: Step) -> int:
+        """k, the number of standard normal numbers that x_t is made of."""
+        proposal: Any = self.proposal
+        if proposal is None:
+            return noise_dimension(now.model, mixture.particles)
+        return proposal.noise_dimension(mixture.particles)
+
+    def predicted(
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step
+    ) -> ParticleMixture:
+        """Draws of x_t ~ D(. | x_{t-1}), with the weights of x_{t-1}."""
+        return predict(key, now.model, mixture, self.gradient, self.noise)
+
+    def _proposed(
+        self, proposed: tuple[PyTree, Float[Array, " n"]], mixture: ParticleMixture, now: Step
+    ) -> ParticleMixture:
+        """The mixture of the proposal's draws, with the log density of each."""
+        (draws, log_density), previous = proposed, mixture.particles
+        check_moved(draws, drawn_part(now.model, previous), self.proposal, "propose")
+        if self.gradient == "stop":
+            draws, log_density = without_gradient((draws, log_density))
+        moved = mixture.replace(particles=completed(now.model, draws, previous))
+        return self.weighed(moved, now, previous, log_density)
+
+    def weighed(
+        self,
+        mixture: ParticleMixture,
+        now: Step,
+        previous: PyTree = None,
+        log_density: Float[Array, " n"] | None = None,
+    ) -> ParticleMixture:
+        """The weights of x_t times L, and D / q where each has been drawn with a log q."""
+        draws = drawn_part(now.model, mixture.particles)
+        mixture, log_factors = self._likelihoods(mixture, now)
+        if log_density is not None:
+            log_factors.append(log_transition(now.model, draws, previous) - log_density)
+        return mixture.weighed(*log_factors)
+
+    def _likelihoods(
+        self, mixture: ParticleMixture, now: Step
+    ) -> tuple[ParticleMixture, list[Array]]:
+        """The particles updated by y_t, and log L as its factors."""
+        states, log_factors = seen(now.model, now.observation, mixture.particles)
+        return mixture.replace(particles=states), log_factors
+
+    def around(self, reference: Reference) -> ConditionalPropagation:
+        """The same around the trajectory, where noise and proposal allow it."""
+        return ConditionalPropagation(self, reference)
+
+
+class Propagate(_Propagation, AbstractPropagationOfEach):
     """Draw x_t and multiply the weights by L(y_t | x_t) D(x_t | x_{t-1}) / q(x_t | x_{t-1}, y_t).
 
     This is the weight update of Vermaak et al. (2003), section 3. With joint weights, ordinary
@@ -59,107 +161,14 @@ class Propagate(AbstractPropagation):
       has, as without an observation, the points are dealt to the particles anew, and errors are
       about those of independent noise. Take it where masses and likelihoods must be accurate.
 
-    Raises `ValueError` for another gradient or noise; for a proposal, or "stop", with a model that
-    has no `log_transition`; for noise that is not independent, with a model that has no
-    `transition_from_noise`, or a proposal that has no `propose_from_noise`; and for more noise
+    Raises `ValueError` for another gradient or noise; in a filter, for a proposal, or "stop", with
+    a model that has no `log_transition`; for noise that is not independent, with a model that has
+    no `transition_from_noise`, or a proposal that has no `propose_from_noise`; and for more noise
     dimensions than there are Sobol direction numbers, 64.
     """
 
-    model: AbstractStateSpaceModel
-    proposal: AbstractProposal | None = None
-    gradient: Gradient = eqx.field(static=True, default="none")
-    noise: Noise = eqx.field(static=True, default="independent")
 
-    draws_each = True
-    """each particle moves without a look at the others."""
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        model, proposal, needs_noise = self.model, self.proposal, self.noise != "independent"
-        # The mixed form has the law of z_t and its noise whatever the model's methods are.
-        has_law = is_mixed(model)
-        if not has_law and (self.gradient == "stop" or proposal is not None):
-            require(model, "log_transition", "gradient='stop' or a proposal")
-        if needs_noise and proposal is not None:
-            require(proposal, "propose_from_noise", f"noise={self.noise!r}", "proposal")
-        elif needs_noise and not has_law:
-            require_noise(model, f"noise={self.noise!r}")
-
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Propagate every particle and weigh it by y_t."""
-        if self.noise != "independent":
-            noise = noise_of_slots(self.noise, key, self.noise_dimension(mixture), mixture)
-            return self.from_noise(noise, mixture, observation)
-        if self.proposal is None:
-            return self.weighed(self.predict(key, mixture), observation)
-        draws = self.proposal.propose(key, observation, mixture.particles)
-        return self._proposed(draws, mixture, observation)
-
-    def from_noise(
-        self, noise: Float[Array, "n k"], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """The same with x_t made of this noise, a row for each slot."""
-        if self.proposal is None:
-            draws = made_of(self.model, noise, mixture.particles)
-            return self.weighed(_moved(draws, self.model, mixture, self.gradient), observation)
-        proposal: Any = self.proposal
-        draws = proposal.propose_from_noise(noise, observation, mixture.particles)
-        return self._proposed(draws, mixture, observation)
-
-    def noise_dimension(self, mixture: ParticleMixture) -> int:
-        """k, the number of standard normal numbers that x_t is made of."""
-        proposal: Any = self.proposal
-        if proposal is None:
-            return noise_dimension(self.model, mixture.particles)
-        return proposal.noise_dimension(mixture.particles)
-
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
-        return predict(key, self.model, mixture, self.gradient, self.noise)
-
-    def _proposed(
-        self,
-        proposed: tuple[PyTree, Float[Array, " n"]],
-        mixture: ParticleMixture,
-        observation: PyTree,
-    ) -> ParticleMixture:
-        """The mixture of the proposal's draws, with the log density of each."""
-        (draws, log_density), previous = proposed, mixture.particles
-        check_moved(draws, drawn_part(self.model, previous), self.proposal, "propose")
-        if self.gradient == "stop":
-            draws, log_density = without_gradient((draws, log_density))
-        moved = mixture.replace(particles=completed(self.model, draws, previous))
-        return self.weighed(moved, observation, previous, log_density)
-
-    def weighed(
-        self,
-        mixture: ParticleMixture,
-        observation: PyTree,
-        previous: PyTree = None,
-        log_density: Float[Array, " n"] | None = None,
-    ) -> ParticleMixture:
-        """The weights of x_t times L, and D / q where each has been drawn with a log q."""
-        draws = drawn_part(self.model, mixture.particles)
-        mixture, log_factors = self._seen(mixture, observation)
-        if log_density is not None:
-            log_factors.append(log_transition(self.model, draws, previous) - log_density)
-        return mixture.weighed(*log_factors)
-
-    def _seen(
-        self, mixture: ParticleMixture, observation: PyTree
-    ) -> tuple[ParticleMixture, list[Array]]:
-        """The particles updated by y_t, and log L as its factors."""
-        states, log_factors = seen(self.model, observation, mixture.particles)
-        return mixture.replace(particles=states), log_factors
-
-    def around(self, reference: Reference) -> ConditionalPropagation:
-        """The same around the trajectory, where noise and proposal allow it."""
-        return ConditionalPropagation(self, reference)
-
-
-class PropagateMarginalised(Propagate):
+class PropagateMarginalised(_Propagation, AbstractPropagationOfEach):
     """Draw z_t, predict, weigh by the predictive density of y_t, and update by it.
 
     The step of a Rao-Blackwellised particle filter, or mixture Kalman filter (Chen and Liu 2000;
@@ -173,8 +182,8 @@ class PropagateMarginalised(Propagate):
     mixed form, z_t is drawn from its law given y_1..y_{t-1}, N(f + A m, A P Aᵀ + V), and first
     updates x_{t-1}. The covariance is updated in Joseph's form, which keeps it positive in float32.
 
-    - `proposal`: z_t ~ q in place of its own law, as `RegimeProposal(model)`. An `AbstractProposal`
-      whose `propose(key, observation, particles)` is given the particles (latent, mean,
+    - `proposal`: z_t ~ q in place of its own law, as `RegimeProposal()`. An `AbstractProposal`
+      whose `propose(key, now, particles)` is given the particles (latent, mean,
       covariance) of t - 1, and returns z_t and log q. The factor is then p(y_t | ...) p(z_t) / q.
     - `gradient`, `noise`: those of `Propagate`, of the draw of z_t. Moments are differentiated.
 
@@ -183,10 +192,13 @@ class PropagateMarginalised(Propagate):
     `mixture_particle_filter` and `auxiliary_particle_filter` use it for such a model.
     """
 
-    model: AbstractConditionallyLinearModel
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for another model, and as `Propagate` does."""
+        check(AbstractConditionallyLinearModel, model=now.model)
+        super().check(now, num_particles, num_components)
 
 
-class Predict(Propagate):
+class Predict(_Propagation):
     """Draw x_t and multiply the weights by D / q alone: the first half of a `Propagate`.
 
     `Reweight` is the second half. Use the two in a chain that does something in between, such as
@@ -197,14 +209,11 @@ class Predict(Propagate):
     weighs = False
     """the likelihood of the observation changes no weight."""
 
-    draws_each = False
-    """what is drawn is not weighed yet, so that no draw is better than another."""
-
-    def _seen(
-        self, mixture: ParticleMixture, observation: PyTree
+    def _likelihoods(
+        self, mixture: ParticleMixture, now: Step
     ) -> tuple[ParticleMixture, list[Array]]:
         """The particles as they are, and nothing of L."""
-        del observation
+        del now
         return mixture, []
 
 
@@ -216,26 +225,28 @@ class Reweight(AbstractPropagation):
     in (0, 1]. Use it after `Predict` and what a chain does to the prediction.
     """
 
-    model: AbstractStateSpaceModel
     exponent: Exponent = eqx.field(static=True, default=1.0)
 
-    keeps_trajectories = True
-    """it weighs the trajectory as any other."""
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a part of a marginalised likelihood."""
+        del num_particles, num_components
         if self.exponent != 1:
-            refuse_marginalised(self.model, "a part of the likelihood", "take exponent 1")
+            refuse_marginalised(now.model, "a part of the likelihood", "take exponent 1")
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Reweight every particle by y_t."""
+    def around(self, reference: Reference) -> "Reweight":
+        """The move itself, which weighs the trajectory as any other."""
+        del reference
+        return self
+
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
+        """Reweight every particle by y_t, unless it is missing."""
         del key
+        if is_missing(now):
+            return mixture
         if self.exponent == 1:
-            states, log_factors = seen(self.model, observation, mixture.particles)
+            states, log_factors = seen(now.model, now.observation, mixture.particles)
             return mixture.replace(particles=states).weighed(*log_factors)
-        log_factors = likelihoods(self.model, observation, mixture.particles)
+        log_factors = likelihoods(now.model, now.observation, mixture.particles)
         # Differences would be lost to rounding beside a large common constant.
         common = finite_max(jnp.where(mixture.occupied, log_factors, -jnp.inf))
         return mixture.weighed(self.exponent * (log_factors - common), self.exponent * common[None])

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp, ndtr
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from mpfjax.checks import check
 from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.models.conditionally_linear import (
@@ -15,7 +16,8 @@ from mpfjax.models.conditionally_linear import (
     updated,
 )
 from mpfjax.models.steps import log_predictive
-from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.base import AbstractPropagation, Step, is_missing
+from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.moves.regrouping.partitions import GroupBy
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import Line, in_line
@@ -24,7 +26,6 @@ from mpfjax.operations.logarithms import log_or_nothing
 from mpfjax.operations.random import uniform
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
-from mpfjax.proposals import AbstractProposal
 
 
 class RegimeProposal(AbstractProposal):
@@ -33,26 +34,24 @@ class RegimeProposal(AbstractProposal):
     Each of the K values of z_t that may follow is weighed by p(z_t | z_{t-1}) and the predictive
     density of y_t, and one is drawn (Chen and Liu 2000; Doucet, Gordon and Krishnamurthy 2001). Its
     `log_normaliser` is exactly log p(y_t | z_{t-1}, y_1..y_{t-1}), so that
-    `auxiliary_particle_filter(model, N, RegimeProposal(model))` is fully adapted: all weights are
+    `auxiliary_particle_filter(model, N, RegimeProposal())` is fully adapted: all weights are
     equal after a step. One step takes K predictive densities a particle.
 
-    - `model`: a conditionally linear model with `all_transitions` and `log_transition`.
-
-    Raises `ValueError` for another model. Use it where the number of regimes is small.
+    Raises `ValueError` in a filter of a model that is not conditionally linear, or has no
+    `all_transitions` or `log_transition`. Use it where the number of regimes is small.
     """
 
-    model: AbstractConditionallyLinearModel
-
-    def __check_init__(self) -> None:
-        require(self.model, "all_transitions", "RegimeProposal")
-        require(self.model, "log_transition", "RegimeProposal")
+    def check(self, now: Step) -> None:
+        """Raise a `ValueError` for another model."""
+        require_regimes(now.model, "RegimeProposal")
+        require(now.model, "log_transition", "RegimeProposal")
 
     def propose(
-        self, key: Key[Array, ""], observation: PyTree, previous_states: MarginalisedState
+        self, key: Key[Array, ""], now: Step, previous_states: MarginalisedState
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """z_t, and log q of each."""
         n, dtype = previous_states.mean.shape[0], previous_states.mean.dtype
-        return self._drawn(uniform(key, (n,), dtype), observation, previous_states)
+        return self._drawn(uniform(key, (n,), dtype), now, previous_states)
 
     def noise_dimension(self, previous_states: MarginalisedState) -> int:
         """1."""
@@ -60,22 +59,20 @@ class RegimeProposal(AbstractProposal):
         return 1
 
     def propose_from_noise(
-        self, noise: Float[Array, "n 1"], observation: PyTree, previous_states: MarginalisedState
+        self, noise: Float[Array, "n 1"], now: Step, previous_states: MarginalisedState
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """The same, made of this noise."""
-        return self._drawn(ndtr(noise[:, 0]), observation, previous_states)
+        return self._drawn(ndtr(noise[:, 0]), now, previous_states)
 
-    def log_normaliser(
-        self, observation: PyTree, previous_states: MarginalisedState
-    ) -> Float[Array, " n"]:
+    def log_normaliser(self, now: Step, previous_states: MarginalisedState) -> Float[Array, " n"]:
         """log p(y_t | z_{t-1}, y_1..y_{t-1}) of every particle, exactly."""
-        _, _, log_factors = children(self.model, observation, previous_states)
+        _, _, log_factors = children(now, previous_states)
         return logsumexp(log_factors, axis=0)
 
     def _drawn(
-        self, shares: Float[Array, " n"], observation: PyTree, previous: MarginalisedState
+        self, shares: Float[Array, " n"], now: Step, previous: MarginalisedState
     ) -> tuple[PyTree, Float[Array, " n"]]:
-        latents, log_priors, log_factors = children(self.model, observation, previous)
+        latents, log_priors, log_factors = children(now, previous)
         # Where y_t is impossible after each of them, they are drawn by their own law.
         possible = jnp.max(log_factors, axis=0) > -jnp.inf
         log_factors = jnp.where(possible[None], log_factors, log_priors)
@@ -96,9 +93,8 @@ class PropagateRegimes(AbstractPropagation):
     number of children equal to the number of slots. Heavy children keep their weight, and none is
     kept twice. Of all unbiased choices this one changes the weights least. A component keeps its
     mass, and Ẑ is unbiased. A `Resample` before it would only add noise: `Filter(model,
-    [PropagateRegimes(model)], N)` is the whole filter.
+    [PropagateRegimes()], N)` is the whole filter.
 
-    - `model`: a conditionally linear model with `all_transitions`.
     - `group`: a `GroupBy` that regroups the children before the choice; None leaves them in their
       parents' components. With a group by the regime, every regime has its share of the slots at
       every step, however improbable it is: the IMM particle filter (Blom and Bloem 2007) with
@@ -106,42 +102,38 @@ class PropagateRegimes(AbstractPropagation):
 
     A derivative treats the probabilities of being kept as constants, as that of
     `Resample(gradient="stop")` does, so that derivatives of Ẑ are unbiased. Without an observation,
-    children have the weight w_i p(z_t | z_{t-1}). Raises `ValueError` for another model. Use it
-    where K is small.
+    children have the weight w_i p(z_t | z_{t-1}). Raises `ValueError` in a filter of a model that
+    is not conditionally linear, or has no `all_transitions`. Use it where K is small.
     """
 
-    model: AbstractConditionallyLinearModel
     group: GroupBy | None = None
 
     keeps_families = False
     """it resamples without a memory of first ancestors."""
 
-    def __check_init__(self) -> None:
-        require(self.model, "all_transitions", "PropagateRegimes")
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for another model."""
+        del num_particles, num_components
+        require_regimes(now.model, "PropagateRegimes")
 
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
+    def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
         """All living components."""
-        del observation
+        del now
         return mixture.active
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Propagate, and weigh by y_t."""
-        latents, _, log_factors = children(self.model, observation, mixture.particles)
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
+        """Propagate, and weigh by y_t where it is there."""
+        model: Any = now.model
+        if is_missing(now):
+            pairs = model.all_transitions(mixture.particles.latent)
+            family = self._family(mixture, [latent for latent, _ in pairs])
+            log_priors = jnp.concatenate([log for _, log in pairs])
+            family = family.replace(log_weights=family.log_weights + log_priors)
+            return self._chosen(key, mixture, family, model)
+        latents, _, log_factors = children(now, mixture.particles)
         family = self._family(mixture, latents).weighed(log_factors.reshape(-1))
-        moved = self._chosen(key, mixture, family)
-        return moved.replace(particles=updated(self.model, observation, moved.particles)[0])
-
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """The same with no observation to weigh by."""
-        pairs = self.model.all_transitions(mixture.particles.latent)  # pyright: ignore
-        family = self._family(mixture, [latent for latent, _ in pairs])
-        log_priors = jnp.concatenate([log for _, log in pairs])
-        family = family.replace(log_weights=family.log_weights + log_priors)
-        return self._chosen(key, mixture, family)
+        moved = self._chosen(key, mixture, family, model)
+        return moved.replace(particles=updated(model, now.observation, moved.particles)[0])
 
     def _family(self, mixture: ParticleMixture, latents: list[PyTree]) -> ParticleMixture:
         """All children, those of a regime side by side, with their parents' weights and moments.
@@ -154,7 +146,7 @@ class PropagateRegimes(AbstractPropagation):
         return family.replace(particles=family.particles._replace(latent=latent), memory={})
 
     def _chosen(
-        self, key: Key[Array, ""], mixture: ParticleMixture, family: ParticleMixture
+        self, key: Key[Array, ""], mixture: ParticleMixture, family: ParticleMixture, model: Any
     ) -> ParticleMixture:
         """N of the N K children, their moments predicted."""
         if self.group is not None:
@@ -181,20 +173,27 @@ class PropagateRegimes(AbstractPropagation):
         gain = jax.lax.stop_gradient(jnp.maximum(log_least - log_weights, 0.0))
         kept = family.at(places)
         return kept.replace(
-            particles=predicted(self.model, kept.particles.latent, kept.particles),
+            particles=predicted(model, kept.particles.latent, kept.particles),
             log_weights=jnp.where(slots.filled, log_weights + gain, -jnp.inf),
             component_indicators=slots.components,
             memory=mixture.memory,
         )
 
 
+def require_regimes(model: Any, needed_by: str) -> None:
+    """Raise a `ValueError` for a model without finitely many regimes."""
+    check(AbstractConditionallyLinearModel, model=model)
+    require(model, "all_transitions", needed_by)
+
+
 def children(
-    model: Any, observation: PyTree, state: MarginalisedState
+    now: Step, state: MarginalisedState
 ) -> tuple[list[PyTree], Float[Array, "k n"], Float[Array, "k n"]]:
     """The K latents that may follow each particle, log p(z_t | z_{t-1}), and that times p(y_t)."""
+    model: Any = now.model
     pairs = model.all_transitions(state.latent)
     latents, log_priors = [latent for latent, _ in pairs], jnp.stack([log for _, log in pairs])
-    log_densities = [log_predictive(model, observation, latent, state) for latent in latents]
+    log_densities = [log_predictive(model, now.observation, latent, state) for latent in latents]
     return latents, log_priors, log_priors + jnp.stack(log_densities)
 
 

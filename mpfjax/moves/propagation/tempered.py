@@ -1,6 +1,6 @@
 """Tempered propagation: the likelihood enters by powers, and particles move in between."""
 
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,11 +10,11 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, InnerShare, entries, to_numbers
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, require_noise
+from mpfjax.models.base import require_noise
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.steps import likelihoods, made_of
-from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.base import AbstractPropagation, AbstractWrapper, Step, is_missing
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.logarithms import finite_max
@@ -35,7 +35,7 @@ _RISING = entries(
 )
 
 
-class PropagateTempered(AbstractPropagation):
+class PropagateTempered(AbstractPropagation, AbstractWrapper):
     """Draw x_t ~ D, then weigh it by L^β1, L^(β2-β1), ... up to L, moving particles in between.
 
     A tempered step, as in a sequential Monte Carlo sampler (Del Moral, Doucet and Jasra 2006), for
@@ -48,7 +48,6 @@ class PropagateTempered(AbstractPropagation):
     s depends on β. Every particle therefore draws s anew each time, with log s uniform between log
     `least_step` and 0.
 
-    - `model`: with `transition_from_noise`.
     - `resample`: the resampling between the stages.
     - `exponents`: β_1 < β_2 < ... < 1; the last is 1.
     - `num_moves`: moves after each stage but the last.
@@ -56,12 +55,11 @@ class PropagateTempered(AbstractPropagation):
 
     A step evaluates the likelihood 1 + `num_moves` (stages - 1) times for each particle. A
     derivative treats the moves that were accepted as given, as with gradient "none" of `Resample`.
-    Raises `ValueError` for a model without `transition_from_noise`, for exponents that do not rise
-    to 1, and for a resampling that sorts, since no point set follows. Use it where the likelihood
-    is much narrower than the dynamics, and no proposal is known.
+    Raises `ValueError` for exponents that do not rise to 1, for a resampling that sorts, since no
+    point set follows, and in a filter of a model without `transition_from_noise`. Use it where the
+    likelihood is much narrower than the dynamics, and no proposal is known.
     """
 
-    model: AbstractStateSpaceModel
     resample: Resample = eqx.field(default_factory=Resample)
     exponents: Annotated[tuple[float, ...], _RISING] = eqx.field(
         converter=to_numbers("exponents"), static=True, default=(1 / 64, 1 / 16, 1 / 4, 1.0)
@@ -69,23 +67,31 @@ class PropagateTempered(AbstractPropagation):
     num_moves: Count = eqx.field(static=True, default=1)
     least_step: InnerShare = eqx.field(static=True, default=0.02)
 
+    holds = ("resample",)
+
     def __check_init__(self) -> None:
         super().__check_init__()
-        refuse_marginalised(self.model, "PropagateTempered")
-        require_noise(self.model, "PropagateTempered")
         if self.resample.sort_by is not None:
             raise ValueError("resample: sort_by has no use between the stages")
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a model that does not make x_t of noise."""
+        super().check(now, num_particles, num_components)
+        refuse_marginalised(now.model, "PropagateTempered")
+        require_noise(now.model, "PropagateTempered")
+
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t, stage by stage."""
-        model, n = cast(Any, self.model), mixture.num_particles
+        model: Any = now.model
+        if is_missing(now):
+            return predict(key, model, mixture, "none")
         key_noise, key_stages = split(key, 2)
         parents = mixture.particles
-        noise = normal(key_noise, (n, model.noise_dimension), noise_dtype(parents))
+        noise = normal(
+            key_noise, (mixture.num_particles, model.noise_dimension), noise_dtype(parents)
+        )
         states = made_of(model, noise, parents)
-        log_likelihoods = likelihoods(self.model, observation, states)
+        log_likelihoods = likelihoods(model, now.observation, states)
         # Resampling may lose a NaN, or a particle whose likelihood is infinite.
         broken = jnp.any(mixture.occupied & ~(log_likelihoods < jnp.inf))
         # Differences between stages would be lost to rounding beside a large common constant.
@@ -98,12 +104,12 @@ class PropagateTempered(AbstractPropagation):
         def next_stage(
             mixture: ParticleMixture, stage: tuple[Any, Any, Any]
         ) -> tuple[ParticleMixture, None]:
-            key, now, later = stage
+            key, power, later = stage
             key_draw, *keys = split(key, 1 + self.num_moves)
-            mixture = self.resample(key_draw, mixture)
+            mixture = self.resample.resample(key_draw, mixture)
             for key_move in keys:
-                mixture = self._moved(key_move, mixture, observation, now, common)
-            log_factors = (later - now) * mixture.particles.log_likelihoods
+                mixture = self._moved(key_move, mixture, now, power, common)
+            log_factors = (later - power) * mixture.particles.log_likelihoods
             return mixture.weighed(log_factors), None
 
         exponents = jnp.asarray(self.exponents, mixture.log_weights.dtype)
@@ -113,29 +119,27 @@ class PropagateTempered(AbstractPropagation):
         log_weights = jnp.where(broken, jnp.nan, mixture.log_weights)
         return mixture.replace(particles=mixture.particles.states, log_weights=log_weights)
 
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
-        return predict(key, self.model, mixture, "none")
-
     def _moved(
         self,
         key: Key[Array, ""],
         mixture: ParticleMixture,
-        observation: PyTree,
+        now: Step,
         exponent: Float[Array, ""],
         common: Float[Array, ""],
     ) -> ParticleMixture:
         """Each particle after one Metropolis step in its noise, with the same parent."""
-        now = mixture.particles
+        here = mixture.particles
         key_step, key_noise, key_taken = split(key, 3)
-        shape, dtype = (mixture.num_particles, 1), now.noise.dtype
+        shape, dtype = (mixture.num_particles, 1), here.noise.dtype
         step = jnp.asarray(self.least_step, dtype) ** uniform(key_step, shape, dtype)
-        noise = jnp.sqrt(1 - step**2) * now.noise + step * normal(key_noise, now.noise.shape, dtype)
-        states = made_of(self.model, noise, mixture.parents)
-        log_likelihoods = likelihoods(self.model, observation, states) - common
-        log_ratio = exponent * log_likelihoods - exponent * now.log_likelihoods
+        noise = jnp.sqrt(1 - step**2) * here.noise + step * normal(
+            key_noise, here.noise.shape, dtype
+        )
+        states = made_of(now.model, noise, mixture.parents)
+        log_likelihoods = likelihoods(now.model, now.observation, states) - common
+        log_ratio = exponent * log_likelihoods - exponent * here.log_likelihoods
         proposed = TemperedParticles(states, noise, log_likelihoods)
-        return mixture.replace(particles=accepted(key_taken, log_ratio, proposed, now))
+        return mixture.replace(particles=accepted(key_taken, log_ratio, proposed, here))
 
 
 def accepted(

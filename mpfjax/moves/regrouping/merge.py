@@ -1,6 +1,7 @@
 """Merge: components that overlap become one. Prune: improbable components are emptied."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +10,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import Count, InnerShare, Positive
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMove, AbstractRegrouping, Regrouped
+from mpfjax.moves.base import AbstractMove, AbstractRegrouping, Regrouped, Step, is_missing
 from mpfjax.moves.regrouping.features import (
     ByFeatures,
     component_groups,
@@ -48,8 +49,9 @@ class Merge(AbstractRegrouping, ByFeatures):
         if self.max_deviations is None and self.max_distance is None:
             raise ValueError("max_deviations, max_distance: at least one must be given")
 
-    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """How many times in a row each pair of components has overlapped, where patience counts."""
+        del model
         if self.patience == 1:
             return {}
         return {"overlap_durations": jnp.zeros((num_components, num_components), jnp.int32)}
@@ -57,22 +59,17 @@ class Merge(AbstractRegrouping, ByFeatures):
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The lowest label of the chain of overlapping components that each particle is in."""
         del key
-        overlap = self._overlap(mixture)
-        memory = mixture.memory
-        if self.patience > 1:
-            durations = jnp.where(overlap, memory["overlap_durations"] + 1, 0)
-            overlap = durations >= self.patience
-            memory = memory | {"overlap_durations": durations}
-        labels = lowest_connected(overlap)
-        return spread(labels, mixture.component_indicators), memory
-
-    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
-        """Reset the counts of pairs with a dead component."""
+        overlap, memory = self._overlap(mixture), mixture.memory
         if self.patience == 1:
-            return memory
-        is_dead = dead[:, None] | dead[None]
-        durations = jnp.where(is_dead, 0, memory["overlap_durations"])
-        return memory | {"overlap_durations": durations}
+            labels = lowest_connected(overlap)
+        else:
+            durations = jnp.where(overlap, memory["overlap_durations"] + 1, 0)
+            labels = lowest_connected(durations >= self.patience)
+            # A label that a later move uses again has no past.
+            is_free = labels != jnp.arange(mixture.num_components, dtype=labels.dtype)
+            durations = jnp.where(is_free[:, None] | is_free[None], 0, durations)
+            memory = memory | {"overlap_durations": durations}
+        return spread(labels, mixture.component_indicators), memory
 
     def _overlap(self, mixture: ParticleMixture) -> Bool[Array, "m m"]:
         weights, labels = relative_weights(mixture), mixture.component_indicators
@@ -136,10 +133,12 @@ class Prune(AbstractMove):
     """the observation changes no weight."""
 
     def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:
-        """Set the weights of improbable components to zero."""
-        del key, observation
+        """Set the weights of improbable components to zero, unless y_t is missing."""
+        del key
+        if is_missing(now):
+            return mixture
         masses = mixture.log_mixture_weights
         heaviest = jnp.max(masses)
         if self.among is not None:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import Count, saying, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractRegrouping, Regrouped
+from mpfjax.moves.base import AbstractRegrouping, Regrouped, Step, is_missing
 from mpfjax.operations.prefix_sums import count_upto
 from mpfjax.operations.random import bits
 from mpfjax.operations.stored import take
@@ -84,10 +84,11 @@ class GroupBy(AbstractRegrouping):
     function: Callable[[PyTree], Int[Array, " n"] | Bool[Array, " n"]] = eqx.field(static=True)
 
     def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:
         """Regroup the particles, also where there is one component: labels are then all zero."""
-        del observation
+        if is_missing(now):
+            return mixture
         indicators, _ = self.regroup(key, mixture)
         return mixture.replace(component_indicators=indicators)
 

@@ -1,15 +1,14 @@
 """Resampling with a look-ahead: the auxiliary particle filter as a move."""
 
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Key
 
 from mpfjax.checks import Rule, saying
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import real_each
-from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.base import AbstractWrapper, Step, is_missing, unless_waiting
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
@@ -17,13 +16,13 @@ from mpfjax.operations.stored import take
 _LOOKAHEAD = Rule(
     lambda look: (
         not isinstance(look, type)
-        and (callable(look) or hasattr(look, "log_normaliser") or hasattr(look, "at_step_of"))
+        and (callable(look) or hasattr(look, "log_normaliser") or hasattr(look, "log_factors"))
     ),
     "a function of an observation and states, nor a proposal with log_normaliser",
 )
 
 
-class AuxiliaryResample(AbstractMove):
+class AuxiliaryResample(AbstractWrapper):
     """Resample in proportion to w_i ν(y_t, x_{t-1}^i), and divide the weights by ν again.
 
     The first stage of the auxiliary particle filter (Pitt and Shephard 1999). The look-ahead ν
@@ -34,13 +33,12 @@ class AuxiliaryResample(AbstractMove):
     components.
 
     - `resample`: the `Resample` that draws; its `ess_threshold` applies to the weights times ν.
-    - `lookahead`: a function (y_t, states) -> log ν of each particle, (n,), or a proposal that has
-      `log_normaliser`, such as `GaussNewtonProposal`. Where ν depends on the step, its
-      `at_step_of(mixture)` gives that function, as of a learned one. The best ν is
-      p(y_t | x_{t-1}). It must be positive for every particle that can explain y_t, and its tails
-      no thinner than those of p(y_t | x_{t-1}): an overconfident ν leaves most of the weight to a
-      few particles. Where ν is zero for all particles of a component, the component is resampled
-      by w alone.
+    - `lookahead`: a function (y_t, states) -> log ν of each particle, (n,); a proposal that has
+      `log_normaliser`, such as `GaussNewtonProposal`; or what has `log_factors(mixture, now)`, as a
+      learned one. The best ν is p(y_t | x_{t-1}). It must be positive for every particle that can
+      explain y_t, and its tails no thinner than those of p(y_t | x_{t-1}): an overconfident ν
+      leaves most of the weight to a few particles. Where ν is zero for all particles of a
+      component, the component is resampled by w alone.
 
     Without an observation nothing is resampled. Raises `ValueError` for a look-ahead that is
     neither function nor such a proposal. Use it, with a proposal of the same kind, where the
@@ -50,60 +48,48 @@ class AuxiliaryResample(AbstractMove):
     resample: Resample
     lookahead: Annotated[Any, _LOOKAHEAD]
 
-    def map_inner(self, change: Callable[[Any], Any]) -> "AuxiliaryResample":
-        """The same with another `Resample`."""
-        return AuxiliaryResample(change(self.resample), self.lookahead)
-
-    @property
-    def resampling(self) -> Resample:
-        """The `Resample` that draws."""
-        return self.resample
-
+    holds = ("resample",)
     weighs = False
     """the weights are divided by the look-ahead again."""
-    keeps_trajectories = True
-    """offspring of the one that is kept are weighed as any."""
+    keeps_mass = False
+    """but what a component weighs is only the same in expectation."""
 
-    @property
-    def reads(self) -> frozenset[str]:
-        """The memory that the look-ahead reads."""
-        return getattr(self.lookahead, "reads", frozenset())
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a model that the look-ahead cannot work with."""
+        super().check(now, num_particles, num_components)
+        if hasattr(self.lookahead, "check"):
+            self.lookahead.check(now)
 
-    @property
-    def particles_per_component(self) -> int | None:
-        """`particles_per_component` of the resampling."""
-        return self.resample.particles_per_component
-
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
+    def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
-        weighed = mixture.weighed(self._log_factors(mixture, observation))
-        return self.resample.would_resample(weighed)
+        return self.resample.would_resample(mixture.weighed(self._log_factors(mixture, now)))
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Resample every component that is due, looking ahead to y_t."""
-        log_factors = self._log_factors(mixture, observation)
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
+        """Resample every component that is due, looking ahead to y_t, unless that is missing."""
+        if is_missing(now):
+            return mixture
+        log_factors = self._log_factors(mixture, now)
         # Resampling may lose a NaN, or a particle whose look-ahead is infinite.
         broken = jnp.any(mixture.occupied & ~(log_factors < jnp.inf))
         due = self.resample.would_resample(mixture.weighed(log_factors))
         log_factors = jnp.where(spread(due, mixture.component_indicators), log_factors, 0.0)
         drawn, ancestors = self.resample.redraw(key, mixture.weighed(log_factors), due)
         drawn = drawn.weighed(-take(log_factors, ancestors.particles))
-        return drawn.replace(log_weights=jnp.where(broken, jnp.nan, drawn.log_weights))
+        drawn = drawn.replace(log_weights=jnp.where(broken, jnp.nan, drawn.log_weights))
+        return unless_waiting(drawn, mixture)
 
-    def _log_factors(self, mixture: ParticleMixture, observation: PyTree) -> Float[Array, " n"]:
+    def _log_factors(self, mixture: ParticleMixture, now: Step) -> Float[Array, " n"]:
         """log ν of each particle, zero in a component where ν is zero throughout."""
         look: Any = self.lookahead
-        if hasattr(look, "at_step_of"):
-            look = look.at_step_of(mixture)
         with saying("in lookahead, which is called with an observation and the particles"):
-            look = getattr(look, "log_normaliser", look)
-            values = look(observation, mixture.particles)
-        values = real_each(values, mixture.num_particles, "lookahead: it")
+            if hasattr(look, "log_factors"):
+                values = look.log_factors(mixture, now)
+            elif hasattr(look, "log_normaliser"):
+                values = look.log_normaliser(now, mixture.particles)
+            else:
+                values = look(now.observation, mixture.particles)
+        values = real_each(values, "lookahead: it", mixture.num_particles)
         log_factors = values.astype(mixture.log_weights.dtype)
-        seen = mixture.weighed(log_factors).active
-        is_seen = spread(seen, mixture.component_indicators) | ~(log_factors < jnp.inf)
-        return jnp.where(is_seen, log_factors, 0.0)
+        has_any = mixture.weighed(log_factors).active
+        counts = spread(has_any, mixture.component_indicators) | ~(log_factors < jnp.inf)
+        return jnp.where(counts, log_factors, 0.0)

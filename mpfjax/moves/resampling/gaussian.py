@@ -12,7 +12,7 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.checks import Count, Positive
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
 from mpfjax.models.noise import draw_noise
-from mpfjax.moves.base import AbstractResampling
+from mpfjax.moves.base import AbstractResampling, Step
 from mpfjax.moves.regrouping.features import origin, summarise
 from mpfjax.moves.resampling.line import sorted_order
 from mpfjax.moves.resampling.resample import Resample
@@ -56,18 +56,14 @@ class GaussianRegeneration(AbstractResampling):
     keeps_parents = False
     """a draw of a Gaussian comes from all particles of its component."""
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
-    ) -> ParticleMixture:
-        """Redraw every living component."""
-        del observation
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for fewer slots than each component is to have."""
+        self._resample.check(now, num_particles, num_components)
+
+    def resample(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """The mixture with every living component redrawn."""
         key_noise, key_rest = split(key, 2)
-        # The slots dealt anew; where the whole state is redrawn, nothing else is used of it.
-        resample = Resample(
-            particles_per_component=self.particles_per_component,
-            allocation="equal" if self.where is None else "variance",
-        )
-        vacated = resample(key_rest, mixture)
+        vacated = self._resample.resample(key_rest, mixture)
         drawn = self._draw(key_noise, self._redrawn(mixture.particles), mixture, vacated)
         if self.where is not None:
             drawn = eqx.tree_at(self.where, vacated.particles, drawn)
@@ -77,9 +73,19 @@ class GaussianRegeneration(AbstractResampling):
         # The next noise is a point set over its slots.
         labels = mixture.component_indicators
         labels = jnp.where(mixture.occupied, labels, mixture.num_components)
-        own = lambda particles: flatten_states(self._redrawn(particles))  # noqa: E731
-        order = sorted_order(mixture, labels, own)
-        return mixture.at(order).replace(in_order=True)
+
+        def place(particles: PyTree) -> Array:
+            return flatten_states(self._redrawn(particles))
+
+        return mixture.at(sorted_order(mixture, labels, place)).replace(in_order=True)
+
+    @property
+    def _resample(self) -> Resample:
+        """Deals the slots anew; where the whole state is redrawn, nothing else is used of it."""
+        return Resample(
+            particles_per_component=self.particles_per_component,
+            allocation="equal" if self.where is None else "variance",
+        )
 
     def _redrawn(self, particles: PyTree) -> PyTree:
         """The part of the state that is redrawn."""

@@ -1,7 +1,7 @@
 """Resampling within components: systematic, stratified, multinomial, residual or SSP."""
 
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import Count, Share, one_of
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractResampling, Gradient
+from mpfjax.moves.base import AbstractResampling, Gradient, Step
 from mpfjax.moves.conditional import REFERENCE
 from mpfjax.moves.eve_indices import with_offspring
 from mpfjax.moves.resampling.allocation import (
@@ -92,11 +92,29 @@ class Resample(AbstractResampling):
         """Whether it may resample, and without a gradient."""
         return self.gradient == "none" and self.ess_threshold > 0
 
+    keeps_families = True
+    """it updates the memory of first ancestors."""
+
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for fewer slots than each component is to have."""
+        del now
+        each = self.particles_per_component or 1
+        if each * num_components > num_particles:
+            raise ValueError(
+                f"num_particles: {num_particles} is less than particles_per_component, {each}, for"
+                f" each of num_components, {num_components}"
+            )
+
+    def around(self, reference: Any) -> "Resample":
+        """The move itself, which finds the slot of the one that is kept in the memory."""
+        del reference
+        return self
+
     def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
+        self, mixture: ParticleMixture, now: Step | None = None
     ) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
-        del observation
+        del now
         if self.ess_threshold == 1.0:
             return mixture.active
         counts = mixture.component_counts
@@ -106,10 +124,8 @@ class Resample(AbstractResampling):
             due = due | (counts != self.particles_per_component)
         return due & (counts > 0)
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
-    ) -> ParticleMixture:
-        """Resample every component that is due."""
+    def resample(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """The mixture with every component resampled that is due."""
         return self.redraw(key, mixture, self.would_resample(mixture))[0]
 
     def redraw(
@@ -157,16 +173,6 @@ class Resample(AbstractResampling):
             kept = {REFERENCE: reference | {"slot": ancestors.kept}}
             redrawn = redrawn.replace(memory=mixture.memory | kept)
         return with_offspring(redrawn, mixture, parents, targets, due), ancestors
-
-    @property
-    def resampling(self) -> "Resample":
-        """The move itself."""
-        return self
-
-    keeps_families = True
-    """it updates the memory of first ancestors."""
-    keeps_trajectories = True
-    """it finds the slot of the one that is kept in the memory."""
 
     def deal(
         self, mixture: ParticleMixture, line: Line, due: Bool[Array, " m"]

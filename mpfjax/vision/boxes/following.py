@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import Count, CountOrZero, checked, to_rows
-from mpfjax.filter import Filter, step_and_faults
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import Fault, one_observation, raise_faults
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
@@ -67,7 +67,7 @@ def follow(
 def _advance(filter, keys, t, mixtures, frame):
     def step(key, mixture):
         step_key = jax.random.fold_in(key, t)
-        mixture, _, faults = step_and_faults(filter, step_key, mixture, frame)
+        mixture, _, faults = filter._step_and_faults(step_key, mixture, frame)
         places = filter.model.boxes(mixture.particles)
         labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
         means = mixture.component_averages(places)
@@ -195,7 +195,7 @@ def _advance_boxes(
 ) -> tuple[ParticleMixture, Tracks, tuple[Fault, ...]]:
     step_keys = split_once(jax.random.fold_in(key, t), len(filter.moves))
     model: Any = filter.model
-    mixture, _, faults = step_and_faults(filter, step_keys, mixture, counted)
+    mixture, _, faults = filter._step_and_faults(step_keys, mixture, counted)
     best, held = best_components(mixture, num_objects)
     means = mixture.component_averages(model.boxes(mixture.particles))
     identities = jnp.where(held, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)

@@ -6,10 +6,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
+from mpfjax.checks import check
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.base import AbstractPropagation, Step, is_missing
 from mpfjax.moves.objects.exclusion import AbstractExclusion
 from mpfjax.moves.regrouping.features import component_groups
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
@@ -92,22 +93,24 @@ class AdaptAppearance(AbstractPropagation):
     The model changes with the data (`approximate` is true). Use it after `Propagate`.
     """
 
-    model: LearnedColourModel
     rate: float = eqx.field(static=True, default=0.1)
 
     approximate = True
     """appearances are learned from the same data that they explain."""
 
-    def __call__(
-        self,
-        key: Key[Array, ""],
-        mixture: ParticleMixture,
-        observation: IntegralHistogram | UInt8[Array, "h w 3"],
-    ) -> ParticleMixture:
-        """Learn from this frame."""
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a model that learns no colours."""
+        del num_particles, num_components
+        check(LearnedColourModel, model=now.model)
+
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
+        """Learn from this frame, unless it is missing."""
         del key
+        if is_missing(now):
+            return mixture
+        model: Any = now.model
         return mixture.replace(
-            particles=self.model.learned(observation, mixture.particles, self.rate)
+            particles=model.learned(now.observation, mixture.particles, self.rate)
         )
 
 
@@ -131,11 +134,11 @@ class ObjectExclusion(AbstractExclusion):
     radius: float = eqx.field(static=True, default=0.5)
     scale: tuple[float, float] = eqx.field(static=True, default=(1.0, 1.0))
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Lower the weight of every particle according to its distance from the other objects."""
-        del key, observation
+        del key
+        if is_missing(now):
+            return mixture
         states, owners = mixture.particles, component_references(mixture)
         centres = states.box[:, :2] / jnp.array([self.scale], states.box.dtype)
         filled = mixture.occupied.astype(centres.dtype)[:, None]

@@ -73,7 +73,7 @@ def default_filters(
         model,
         moves=[
             Resample(particles_per_component=PARTICLES_PER_COMPONENT),
-            Propagate(model),
+            Propagate(),
             Exclusion(strength=4.0, radius=0.5, **where),
             Merge(None, 0.25, patience=10, **where),
             Split(4.0, 0.5, min_share=0.15, **where),
@@ -110,7 +110,7 @@ def objects_filters(
     walk = WalkWithVelocity(walk, (0.1, 0.1, 0.0, 0.0), speeds)
     model: Any = _own_references(frame, boxes, steps, walk, kind=LearnedColourModel)
     apart = _apart(size)
-    learn = AdaptAppearance(model, rate=0.03)
+    learn = AdaptAppearance(rate=0.03)
     num_components = most_components(len(boxes))
     num_particles = PARTICLES_PER_HYPOTHESIS * num_components
     exclusion = ObjectExclusion(strength=3.0, radius=0.35, scale=(float(size[0]), float(size[1])))
@@ -118,7 +118,7 @@ def objects_filters(
         model,
         moves=[
             Resample(share_by=_object),
-            Propagate(model),
+            Propagate(),
             *([exclusion] if len(boxes) > 1 else []),
             learn,
             Merge(None, 0.25, patience=10, **apart),
@@ -130,7 +130,7 @@ def objects_filters(
         # Each particle in the component of its object, as a start for hypotheses about it.
         initial_moves=[GroupBy(_object)],
     )
-    alone = Filter(model, moves=[Resample(), Propagate(model), learn], num_particles=num_particles)
+    alone = Filter(model, moves=[Resample(), Propagate(), learn], num_particles=num_particles)
     return {"pf": alone, "mpf": mixture}
 
 

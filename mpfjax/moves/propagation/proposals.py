@@ -11,25 +11,31 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import POSITIVE, Checked, Count, Positive, checked, to_array
+from mpfjax.checks import POSITIVE, Count, Positive, checked, to_array
 from mpfjax.models.base import require
+from mpfjax.moves.base import Given, Step
 from mpfjax.operations.matrices import cholesky, solve_lower
 from mpfjax.operations.random import normal
 
 
-class AbstractProposal(Checked):
+class AbstractProposal(Given):
     """A way to draw x_t given x_{t-1} and y_t, with the density of each draw."""
+
+    def check(self, now: Step) -> None:
+        """Raise a `ValueError` for a model that the proposal is not for; most are for any."""
+        del now
 
     @abc.abstractmethod
     def propose(
-        self, key: Key[Array, ""], observation: PyTree, previous_states: PyTree
+        self, key: Key[Array, ""], now: Step, previous_states: PyTree
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """x_t ~ q(. | x_{t-1}, y_t) for every particle, and log q of each, shape (n,).
 
-        A proposal may also have `log_density(observation, states, previous_states)`, log q of
+        `now` has the model, y_t and u_t. A proposal may also have
+        `log_density(now, states, previous_states)`, log q of
         states that were not drawn from it, (n,). `mpfjax.smoothing.conditional_filter` needs it.
         And it may make its draws of standard normal noise, (n, k), which `Propagate(noise="rqmc")`
-        needs: `propose_from_noise(noise, observation, previous_states)` returns what `propose`
+        needs: `propose_from_noise(noise, now, previous_states)` returns what `propose`
         does, and `noise_dimension(previous_states)` is k.
         """
 
@@ -38,12 +44,12 @@ class _GaussianProposal(AbstractProposal):
     """A proposal whose draw is made of as many normal numbers as the state has."""
 
     def propose(
-        self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]
+        self, key: Key[Array, ""], now: Step, previous_states: Float[Array, "n ..."]
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """x_t from the Gaussian of every particle, and its log density."""
         shape = (previous_states.shape[0], self.noise_dimension(previous_states))
         noise = normal(key, shape, previous_states.dtype)
-        return self.propose_from_noise(noise, observation, previous_states)
+        return self.propose_from_noise(noise, now, previous_states)
 
     def noise_dimension(self, previous_states: Float[Array, "n ..."]) -> int:
         """d."""
@@ -51,7 +57,7 @@ class _GaussianProposal(AbstractProposal):
 
     @abc.abstractmethod
     def propose_from_noise(
-        self, noise: Float[Array, "n d"], observation: PyTree, previous_states: PyTree
+        self, noise: Float[Array, "n d"], now: Step, previous_states: PyTree
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """The same, made of this noise."""
 
@@ -99,26 +105,26 @@ class NetworkProposal(_GaussianProposal):
     def propose_from_noise(
         self,
         noise: Float[Array, "n d"],
-        observation: PyTree,
+        now: Step,
         previous_states: Float[Array, "n ..."],
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """The same, made of this noise."""
-        means, deviations = self._moments(observation, previous_states)
+        means, deviations = self._moments(now.observation, previous_states)
         states = means + deviations * noise
         return states.reshape(previous_states.shape), _log_standard(noise, deviations)
 
     def log_density(
         self,
-        observation: PyTree,
+        now: Step,
         states: Float[Array, "n ..."],
         previous_states: Float[Array, "n ..."],
     ) -> Float[Array, " n"]:
         """log q(x_t | x_{t-1}, y_t) of every particle."""
-        means, deviations = self._moments(observation, previous_states)
+        means, deviations = self._moments(now.observation, previous_states)
         return _log_standard((states.reshape(means.shape) - means) / deviations, deviations)
 
     def _moments(
-        self, observation: PyTree, previous_states: Float[Array, "n ..."]
+        self, now: Step, previous_states: Float[Array, "n ..."]
     ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
         """The mean and deviations of every particle's Gaussian."""
         previous = previous_states.reshape(previous_states.shape[0], -1)
@@ -139,41 +145,41 @@ class GaussNewtonProposal(_GaussianProposal):
     Andrieu 2000, section II.D, local linearisation). The draw is from N(mean, inflation² Λ⁻¹). An
     inflation above one keeps the weights bounded if the Gaussian is narrower than the target.
 
-    - `model`: has `transition_mean`, `observation_mean`, `transition_covariance`, (d, d), and
-      `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.
+    The model has `transition_mean`, `observation_mean`, `transition_covariance`, (d, d), and
+    `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.
 
-    Raises `ValueError` for a model without these means, no iterations, or an inflation not above 0.
-    Use it where bootstrap particles mostly miss the likelihood.
+    Raises `ValueError` for no iterations, or an inflation not above 0, and in a filter of a model
+    without these means. Use it where bootstrap particles mostly miss the likelihood.
     """
 
-    model: Any
     num_iterations: Count = eqx.field(static=True, default=4)
     inflation: Positive = eqx.field(static=True, default=1.1)
 
-    def __check_init__(self) -> None:
+    def check(self, now: Step) -> None:
+        """Raise a `ValueError` for a model without the means."""
         for mean in ("transition_mean", "observation_mean"):
-            require(self.model, mean, "GaussNewtonProposal")
+            require(now.model, mean, "GaussNewtonProposal")
 
     def propose_from_noise(
         self,
         noise: Float[Array, "n d"],
-        observation: PyTree,
+        now: Step,
         previous_states: Float[Array, "n ..."],
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """The same, made of this noise."""
-        prior_means = self.model.transition_mean(previous_states)
-        means, factors = self._fit(observation, prior_means)
+        prior_means = _model(now).transition_mean(previous_states)
+        means, factors = self._fit(now, prior_means)
         states = means + self.inflation * _solve_transposed(factors, noise)
         return states.reshape(prior_means.shape), self._log_density(noise, factors)
 
     def log_density(
         self,
-        observation: PyTree,
+        now: Step,
         states: Float[Array, "n ..."],
         previous_states: Float[Array, "n ..."],
     ) -> Float[Array, " n"]:
         """log q(x_t | x_{t-1}, y_t) of every particle."""
-        means, factors = self._fit(observation, self.model.transition_mean(previous_states))
+        means, factors = self._fit(now, _model(now).transition_mean(previous_states))
         residuals = (states.reshape(means.shape) - means) / self.inflation
         return self._log_density(jnp.einsum("nij,ni->nj", factors, residuals), factors)
 
@@ -190,7 +196,7 @@ class GaussNewtonProposal(_GaussianProposal):
         return log_density.astype(noise.dtype)
 
     def log_normaliser(
-        self, observation: PyTree, previous_states: Float[Array, "n ..."]
+        self, now: Step, previous_states: Float[Array, "n ..."]
     ) -> Float[Array, " n"]:
         """log p(y_t | x_{t-1}) of every particle by the fitted Gaussian, shape (n,).
 
@@ -199,12 +205,13 @@ class GaussNewtonProposal(_GaussianProposal):
         `LinearGaussianModel`. It does not depend on the inflation. Use it as the look-ahead of
         `AuxiliaryResample`.
         """
-        prior_means = self.model.transition_mean(previous_states)
-        means, factors = self._fit(observation, prior_means)
-        seen = self.model.observation_mean(means.reshape(prior_means.shape))
-        covariance_y = _matrix(self.model.observation_covariance).astype(means.dtype)
-        covariance = _matrix(self.model.transition_covariance).astype(means.dtype)
-        missed = jnp.atleast_1d(observation).astype(means.dtype)[None] - seen.reshape(
+        prior_means = _model(now).transition_mean(previous_states)
+        means, factors = self._fit(now, prior_means)
+        model = _model(now)
+        seen = model.observation_mean(means.reshape(prior_means.shape))
+        covariance_y = _matrix(model.observation_covariance).astype(means.dtype)
+        covariance = _matrix(model.transition_covariance).astype(means.dtype)
+        missed = jnp.atleast_1d(now.observation).astype(means.dtype)[None] - seen.reshape(
             means.shape[0], -1
         )
         moved = means - prior_means.reshape(means.shape)
@@ -219,17 +226,17 @@ class GaussNewtonProposal(_GaussianProposal):
         return log_volume - 0.5 * squares - log_scale.astype(means.dtype)
 
     def _fit(
-        self, observation: Float[Array, "..."], prior_means: Float[Array, "n ..."]
+        self, now: Step, prior_means: Float[Array, "n ..."]
     ) -> tuple[Float[Array, "n d"], Float[Array, "n d d"]]:
         """The means, and the Cholesky factors of the precisions Λ."""
-        state_shape = prior_means.shape[1:]
+        model, state_shape = _model(now), prior_means.shape[1:]
         prior = prior_means.reshape(prior_means.shape[0], -1)
-        target = jnp.atleast_1d(observation).astype(prior.dtype)
-        prior_precision = _inverse(_matrix(self.model.transition_covariance)).astype(prior.dtype)
-        precision_y = _inverse(_matrix(self.model.observation_covariance)).astype(prior.dtype)
+        target = jnp.atleast_1d(now.observation).astype(prior.dtype)
+        prior_precision = _inverse(_matrix(model.transition_covariance)).astype(prior.dtype)
+        precision_y = _inverse(_matrix(model.observation_covariance)).astype(prior.dtype)
 
         def observe(state: Float[Array, " d"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-            value = self.model.observation_mean(state.reshape(1, *state_shape)).reshape(-1)
+            value = model.observation_mean(state.reshape(1, *state_shape)).reshape(-1)
             return value, value
 
         linearise = jax.vmap(jax.jacfwd(observe, has_aux=True))
@@ -243,6 +250,11 @@ class GaussNewtonProposal(_GaussianProposal):
             factors = cholesky(precisions)
             means = _solve_transposed(factors, solve_lower(factors, information))
         return means, factors
+
+
+def _model(now: Step) -> Any:
+    """The model, whose means a type checker does not know of."""
+    return now.model
 
 
 def _log_standard(
