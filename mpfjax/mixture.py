@@ -23,6 +23,7 @@ from mpfjax.operations.logarithms import (
     softmax,
 )
 from mpfjax.operations.prefix_sums import sum_before
+from mpfjax.operations.rows import along_rows, select_rows
 from mpfjax.operations.segments import (
     segment_any,
     segment_counts,
@@ -188,8 +189,8 @@ class ParticleMixture(eqx.Module):
         """
         values = _numbers(values)
         weights = self.component_weights.astype(values.dtype)
-        filled = jnp.where(_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
-        return self.component_sums(_rows(weights, values) * filled)
+        filled = jnp.where(along_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
+        return self.component_sums(along_rows(weights, values) * filled)
 
     def component_means(self, periods: PyTree = None) -> PyTree:
         """The weighted mean of each component: every leaf (m, ...), zero for a dead one.
@@ -253,8 +254,8 @@ class ParticleMixture(eqx.Module):
         numbers and booleans are averaged as floating point numbers.
         """
         values = _numbers(values)
-        is_filled, zero = _rows(self.occupied, values), jnp.zeros((), values.dtype)
-        products = _rows(self.weights.astype(values.dtype), values) * jnp.where(
+        is_filled, zero = along_rows(self.occupied, values), jnp.zeros((), values.dtype)
+        products = along_rows(self.weights.astype(values.dtype), values) * jnp.where(
             is_filled, values, zero
         )
         # On a CPU, XLA may take thirty times as long for a sum that also multiplies.
@@ -343,14 +344,8 @@ class ParticleMixture(eqx.Module):
         log_share = (other.log_scale - log_scale) - math.log(num_islands())
         brought = other.replace(log_weights=other.log_weights + log_share).at(rank)
         own = self.replace(log_weights=self.log_weights + (self.log_scale - log_scale))
-
-        def pick(new: Array, old: Array) -> Array:
-            return jnp.where(_rows(is_new, new), new, old)
-
-        slots = {
-            name: jax.tree.map(pick, getattr(brought, name), getattr(own, name))
-            for name in _OF_SLOTS
-        }
+        theirs, ours = ({name: getattr(m, name) for name in _OF_SLOTS} for m in (brought, own))
+        slots = select_rows(is_new, theirs, ours)
         return own.replace(**slots, log_scale=log_scale, usable_slots=first + number)
 
     def with_own_ancestors(self) -> "ParticleMixture":
@@ -462,7 +457,3 @@ def _numbers(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:
 def _inverse(squares: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
     """1 / Σ w², zero where there is no weight."""
     return jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1.0), 0.0)
-
-
-def _rows(per_particle: Array, values: Array) -> Array:
-    return per_particle.reshape(per_particle.shape + (1,) * (values.ndim - 1))
