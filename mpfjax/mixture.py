@@ -64,7 +64,8 @@ class ParticleMixture(eqx.Module):
     - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
     - `component_indicators`: C, shape (n,), in [0, num_components).
     - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from,
-      -1 for a particle that came from no single one (`AbstractMove.keeps_parents`).
+      -1 for a particle that came from no single one (`AbstractMove.keeps_parents`). Among others
+      that did, it is one that began anew; see `began_anew`.
     - `num_components`: M, the most components that there can be, dead ones included; static. The
       filters of the literature call it `max_components`.
     - `memory`: the memory that moves keep from step to step, by the move's name.
@@ -112,6 +113,16 @@ class ParticleMixture(eqx.Module):
     def occupied(self) -> Bool[Array, " n"]:
         """Which slots hold a particle of positive weight."""
         return self.log_weights > -jnp.inf
+
+    @property
+    def began_anew(self) -> Bool[Array, " n"]:
+        """Which slots hold a state that began anew in this step, by `with_restarts`.
+
+        The state before then says nothing of it: it is distributed as the mixture before.
+        """
+        is_orphan = self.ancestor_indices < 0
+        # Where none has an ancestor, they were drawn from several, or from a density.
+        return is_orphan & ~jnp.all(is_orphan)
 
     @property
     def weights(self) -> Float[Array, " n"]:

@@ -6,7 +6,6 @@ from typing import Annotated, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import POSITIVE, SHARES, Fitting, to_array
@@ -19,11 +18,13 @@ from mpfjax.models.base import (
 )
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.steps import own_likelihoods
+from mpfjax.operations.logarithms import log_or_nothing
 
 # What the object's model has beside its three methods and its likelihood of one measurement.
 _PASSED_ON = (
     "log_transition", "log_initial", "with_history", "initial_from_noise", "transition_from_noise",
     "initial_noise_dimension", "noise_dimension", "transition_mean", "transition_covariance",
+    "periods",
 )  # fmt: skip
 
 
@@ -93,7 +94,7 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
         there = _measured(observation)
 
         def fill(leaf: Array) -> Array:
-            # A number that no logarithm turns into one that is not finite, nor its gradient.
+            """A number that no logarithm turns into one that is not finite, nor its gradient."""
             return jnp.where(jnp.isnan(leaf), jnp.ones_like(leaf), leaf)
 
         def log_odds(measurement: PyTree) -> Float[Array, " n"]:
@@ -106,8 +107,12 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
         p = self.detection_probability
         p = mapped(self.object_model, p)(states) if callable(p) else p
         p = jnp.broadcast_to(p, odds.shape[1:]).astype(odds.dtype)
-        detected = jnp.where(there[:, None], odds + jnp.log(p)[None], -jnp.inf)
-        return logsumexp(jnp.concatenate([jnp.log1p(-p)[None], detected]), axis=0)
+        odds = jnp.where(there[:, None], odds, -jnp.inf)
+        # Chances of 0 and 1 have no logarithm, but the likelihood has a derivative there.
+        largest = jax.lax.stop_gradient(jnp.maximum(jnp.max(odds, axis=0, initial=0.0), 0.0))
+        missed = (1 - p) * jnp.exp(-largest)
+        detected = p * jnp.sum(jnp.exp(odds - largest[None]), axis=0)
+        return largest + log_or_nothing(missed + detected)
 
     def __getattr__(self, name: str) -> Any:
         # Only reached for names that the class lacks.

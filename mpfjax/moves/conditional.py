@@ -16,6 +16,7 @@ from jaxtyping import Array, Int, Key, PyTree
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractPropagation, Step, is_missing
+from mpfjax.operations.rows import select_rows
 from mpfjax.operations.stored import take
 
 REFERENCE = "reference"  # the name of its slot and time in a mixture's memory
@@ -86,4 +87,4 @@ def at(values: Array, place: Int[Array, ""]) -> Array:
 def put(values: Array, value: Array, place: Int[Array, ""]) -> Array:
     """The values with another one at an index."""
     is_place = jnp.arange(values.shape[0], dtype=jnp.int32) == place
-    return jnp.where(is_place.reshape(-1, *[1] * (values.ndim - 1)), value[None], values)
+    return select_rows(is_place, value[None], values)

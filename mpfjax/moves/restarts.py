@@ -61,6 +61,8 @@ class Restart(AbstractWrapper):
 
     holds = ("resample",)
     keeps_mass = False
+    keeps_parents = False
+    """a state that begins anew has none."""
     keeps_families = False
 
     def __check_init__(self) -> None:

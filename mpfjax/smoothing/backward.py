@@ -2,6 +2,8 @@
 
 The index of x_s given x_{s+1} has the probabilities W_s^i D(x_{s+1} | x_s^i), where W_s are the
 joint weights of the mixture at s. Component indicators do not enter, since the weights are joint.
+Where the state began anew at s + 1 (`with_restarts`), x_{s+1} says nothing of x_s, and the
+probabilities are W_s^i: so it is exact for the pair of the state and whether it began anew.
 """
 
 import math
@@ -69,14 +71,21 @@ def draw_ends(
     return indices, jax.tree.map(lambda leaf: take(leaf, indices), final.particles)
 
 
-def log_transition_from(model: Any, mixture: ParticleMixture) -> Callable[[PyTree], Array]:
-    """log D(state | x^i) of every particle, (n,), as a function of one state."""
+def log_kernel_from(
+    model: Any, mixture: ParticleMixture
+) -> Callable[[tuple[PyTree, Bool[Array, ""]]], Array]:
+    """log of the kernel from every particle, (n,), as a function of a state and if it began anew.
+
+    It is log D(state | x^i), or zero for all i where the state began anew.
+    """
     n = mixture.num_particles
 
-    def log_density(state: PyTree) -> Float[Array, " n"]:
+    def log_density(future: tuple[PyTree, Bool[Array, ""]]) -> Float[Array, " n"]:
+        state, began_anew = future
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), state)
         values = model.log_transition(copies, mixture.particles)
-        return real_each(values, n, model, "log_transition")
+        values = real_each(values, n, model, "log_transition")
+        return jnp.where(began_anew, jnp.zeros_like(values), values)
 
     return log_density
 

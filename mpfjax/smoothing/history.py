@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mpfjax.checks import checked
 from mpfjax.mixture import ParticleMixture
@@ -35,16 +35,25 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     )
 
 
+def starts_of(mixtures: ParticleMixture) -> Bool[Array, "t n"]:
+    """Which particles began anew, at every time."""
+    return jax.vmap(lambda mixture: mixture.began_anew)(mixtures)
+
+
 def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:
     """The mixtures; an error where a particle comes from no single one of the step before."""
     is_orphan = (mixtures.ancestor_indices < 0) & (mixtures.log_weights > -jnp.inf)
-    found = jnp.any(is_orphan[1:])
-    message = (
-        f"mixtures: {needed_by} follows ancestors, and particles of index -1 have no single one"
-    )
-    if isinstance(found, Tracer):
-        return eqx.error_if(mixtures, found, message)
-    if found:
+    what = "follows ancestors, and particles of index -1 have no single one, as after restarts"
+    return refused_where(jnp.any(is_orphan[1:]), f"mixtures: {needed_by} {what}", mixtures)
+
+
+def refused_where(
+    is_wrong: Bool[Array, ""], message: str, mixtures: ParticleMixture
+) -> ParticleMixture:
+    """The mixtures; a `ValueError` where they are wrong, or a RuntimeError within jit."""
+    if isinstance(is_wrong, Tracer):
+        return eqx.error_if(mixtures, is_wrong, message)
+    if is_wrong:
         raise ValueError(message)
     return mixtures
 
@@ -88,7 +97,7 @@ def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
 
     `mixtures` is a run of `run_filter(..., collect=None)`, whose first time is then x_0, or the
     mixtures that it collected, whose first time is x_1. Raises `ValueError` for anything else, and
-    where particles have no single ancestors (index -1; RuntimeError within jit). Use it to see how
+    where particles have no single ancestors, as after restarts (index -1; RuntimeError within jit). Use it to see how
     far back the history of a mode goes. Resampling leaves few ancestors at early
     times; `sample_trajectories` draws new ones.
     """

@@ -32,7 +32,7 @@ from mpfjax.running.scan import (
     sound,
     step_or_predict,
 )
-from mpfjax.smoothing.backward import draw, draw_exactly, log_transition_from, walk
+from mpfjax.smoothing.backward import draw, draw_exactly, log_kernel_from, walk
 
 
 class SmoothedSums(eqx.Module):
@@ -67,7 +67,7 @@ def smoothed_sums(
     trajectories that end in it. Some particles J of step t - 1 are drawn by the backward kernel,
     W_{t-1}^J D(x_t^i | x_{t-1}^J), and τ_t^i is the mean of τ_{t-1}^J + h(x_{t-1}^J, x_t^i) over
     them. The estimate is Σ_i W_t^i τ_t^i. W are joint weights, so this holds for a mixture too: a
-    particle may come from another component. Times Ẑ, it is unbiased if Ẑ is. The filter's run is
+    particle may come from another component, and with restarts from anywhere. Times Ẑ, it is unbiased if Ẑ is. The filter's run is
     that of `run_filter` with the same key.
 
     - `function`: h. It takes x_{t-1} and x_t of n particles, leaves (n, ...), and returns values of
@@ -227,9 +227,9 @@ class FixedLagSmoother(Checked):
         model, num_draws = with_inputs(self.filter.model, inputs), self.num_draws
         needed, start = moved.occupied, moved.ancestor_indices
         if self.method == "exact":
-            log_density = log_transition_from(model, mixture)
-            futures = moved.particles
-            indices = draw_exactly(key, log_density, futures, mixture, num_draws, needed)
+            log_kernel = log_kernel_from(model, mixture)
+            futures = moved.particles, moved.began_anew
+            indices = draw_exactly(key, log_kernel, futures, mixture, num_draws, needed)
         else:
             key_proposed, key_walk = split(key, 2)
             # The start counts as a draw, unless it would be the only one.

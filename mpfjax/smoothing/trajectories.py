@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.checks import Count, CountOrZero, checked, warn
 from mpfjax.mixture import ParticleMixture
@@ -21,8 +21,8 @@ from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split_keys
 from mpfjax.operations.stored import take
 from mpfjax.running.scan import FilterRun
-from mpfjax.smoothing.backward import draw, draw_ends, draw_exactly, log_transition_from, walk
-from mpfjax.smoothing.history import mixtures_of, with_parents
+from mpfjax.smoothing.backward import draw, draw_ends, draw_exactly, log_kernel_from, walk
+from mpfjax.smoothing.history import mixtures_of, starts_of, with_parents
 from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
 # Below this share of distinct states estimates of the past are poor, however many are drawn.
@@ -47,7 +47,8 @@ def sample_trajectories(
     Backward sampling (Godsill, Doucet and West 2004): x_t is drawn by the weights of the last
     mixture, then each x_{s} by W_s^i D(x_{s+1} | x_s^i), W_s the joint weights of the mixture at s.
     Component indicators have no part in it, since the weights are joint: a mixture filter is
-    smoothed like any other.
+    smoothed like any other. Where a state began anew at s + 1 (`with_restarts`), x_s is drawn by
+    W_s alone, which is exact for the kernel with restarts.
 
     - `mixtures`: a run of `run_filter(..., collect=None)`, or the mixtures that it collected.
     - `num_trajectories`: k. Leaves of the result are (k, t + 1, ...); (k, t, ...), without x_0, for
@@ -66,9 +67,9 @@ def sample_trajectories(
       each x_s given these and y_1..y_t. It needs a whole run, with x_0, and method "exact".
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
-    that is not there or dead, and for "mcmc" where particles have no single ancestors (index -1;
-    RuntimeError within jit); a RuntimeError where no particle
-    can have moved to the next. If the backward weights degenerate, so that at some time fewer than
+    that is not there or dead, and for "mcmc" where particles have no single ancestors, as with
+    restarts (index -1; RuntimeError within jit); a RuntimeError where no particle can have moved to
+    the next. If the backward weights degenerate, so that at some time fewer than
     a tenth of the trajectories are distinct, a RuntimeWarning names the share. Use it for estimates
     of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but has few
     distinct states at early times.
@@ -87,7 +88,7 @@ def sample_trajectories(
         _check_component(stacked, component)
     if is_marginalised(model) or observations is not None:
         observations = as_arrays(gathered(observations).observations)
-        check_marginalised(model, stacked, observations, method)
+        stacked = check_marginalised(model, stacked, observations, method)
         drawn, indices = sample_marginalised(
             key, model, stacked, observations, inputs, num_trajectories, component
         )
@@ -96,7 +97,7 @@ def sample_trajectories(
             stacked = with_parents(stacked, "sample_trajectories with method 'mcmc', not 'exact',")
         options = (num_trajectories, component, 0 if method == "exact" else num_steps or 1)
         drawn, indices = draw_trajectories(key, model, stacked, inputs, *options)
-    _warn_of_few(indices, stacked.log_weights)
+    _warn_of_few(indices, stacked)
     return drawn
 
 
@@ -120,12 +121,13 @@ def draw_trajectories(
 
     def back(carry: tuple[PyTree, Array], step: Any) -> tuple[tuple[PyTree, Array], PyTree]:
         next_states, next_indices = carry
-        step_key, earlier, ancestors, proposed, now = step
+        step_key, earlier, ancestors, began_anew, proposed, now = step
         moved_by = with_inputs(model, now)
         if proposed is None:
-            log_density = log_transition_from(moved_by, earlier)
-            found = draw_exactly(step_key, log_density, next_states, earlier, checked=checked)
-            indices = found[:, 0]
+            futures = next_states, take(began_anew, next_indices)
+            log_kernel = log_kernel_from(moved_by, earlier)
+            drawn = draw_exactly(step_key, log_kernel, futures, earlier, checked=checked)
+            indices = drawn[:, 0]
         else:
             start = take(ancestors, next_indices)
             indices = walk(step_key, moved_by, next_states, earlier, start, proposed)[-1]
@@ -141,7 +143,7 @@ def draw_trajectories(
         shape = (num_steps, num_trajectories)
         proposed = jax.vmap(lambda key, logs: draw(key, shape, logs))(keys, earlier.log_weights)
     keys = jax.random.split(key_steps, num_earlier)
-    steps = (keys, earlier, ancestors, proposed, inputs)
+    steps = (keys, earlier, ancestors, starts_of(mixtures)[1:], proposed, inputs)
     _, past = jax.lax.scan(back, (states, last), steps, reverse=True)
     states, indices = jax.tree.map(
         lambda before, end: jnp.concatenate([before, end[None]]), past, (states, last)
@@ -149,27 +151,29 @@ def draw_trajectories(
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states), indices
 
 
-def _warn_of_few(indices: Int[Array, "t k"], log_weights: Float[Array, "t n"]) -> None:
+def _warn_of_few(indices: Int[Array, "t k"], mixtures: ParticleMixture) -> None:
     """A RuntimeWarning where few trajectories are distinct because backward weights degenerate.
 
     The share at a time is the number of distinct particles over the largest possible number: that
     of the trajectories, or of the particles of positive weight where these are fewer. It may be
     small where few particles fit, although each of these has many pasts, and so counts only where
-    trajectories that share a particle nearly always share the one before as well. Within the
-    caller's own jit there is no warning.
+    trajectories that share a particle nearly always share the one before as well, unless that
+    particle began anew, whose past is any. Within the caller's own jit there is no warning.
     """
-    is_known = lambda leaf: not isinstance(leaf, Tracer) and leaf.is_fully_addressable  # noqa: E731
-    if not (is_known(indices) and is_known(log_weights)):
+    arrays = indices, mixtures.log_weights, mixtures.ancestor_indices
+    if any(isinstance(leaf, Tracer) or not leaf.is_fully_addressable for leaf in arrays):
         return
-    num_particles = log_weights.shape[1]
+    num_particles = mixtures.log_weights.shape[1]
     drawn = np.asarray(indices, np.int64)[:, :num_particles]
     num_drawn, counts = drawn.shape[1], _num_distinct(drawn)
     few = np.flatnonzero(counts[:-1] < _SMALL_SHARE * num_drawn)
-    shared = (num_drawn - counts[1:]).sum()
+    starts = np.take_along_axis(np.asarray(starts_of(mixtures)), drawn, axis=1)
+    goes_on = ~starts[1:].any(axis=1)
+    shared = (num_drawn - counts[1:])[goes_on].sum()
     own_pasts = _num_distinct(drawn[:-1] * num_particles + drawn[1:]) - counts[1:]
-    if few.size == 0 or own_pasts.sum() > _SMALL_SHARE * shared:
+    if few.size == 0 or own_pasts[goes_on].sum() > _SMALL_SHARE * shared:
         return
-    possible = (np.asarray(log_weights)[few] > -np.inf).sum(axis=1)
+    possible = (np.asarray(mixtures.log_weights)[few] > -np.inf).sum(axis=1)
     shares = counts[few] / np.minimum(num_drawn, possible)
     worst = int(np.argmin(shares))
     if shares[worst] < _SMALL_SHARE:

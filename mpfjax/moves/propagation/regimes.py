@@ -24,6 +24,7 @@ from mpfjax.moves.resampling.line import Line, in_line
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.logarithms import log_or_nothing
 from mpfjax.operations.random import uniform
+from mpfjax.operations.rows import select_rows
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
 
@@ -225,8 +226,7 @@ def _threshold(line: Line, targets: Int[Array, " m"]) -> Float[Array, " m"]:
 
 def _row(table: Array, rows: Int[Array, " n"]) -> Array:
     """table[rows[i], i] of each i, by comparing, which runs on vectors."""
-    found = table[0]
+    row = table[0]
     for k in range(1, table.shape[0]):
-        is_row = (rows == k).reshape(-1, *[1] * (found.ndim - 1))
-        found = jnp.where(is_row, table[k], found)
-    return found
+        row = select_rows(rows == k, table[k], row)
+    return row

@@ -19,6 +19,7 @@ from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.logarithms import finite_max
 from mpfjax.operations.random import normal, split, uniform
+from mpfjax.operations.rows import select_rows
 
 
 class TemperedParticles(NamedTuple):
@@ -150,8 +151,4 @@ def accepted(
     A ratio that is NaN is rejected.
     """
     taken = jnp.log(uniform(key, log_ratio.shape, log_ratio.dtype)) < log_ratio
-
-    def pick(new: Array, old: Array) -> Array:
-        return jnp.where(taken.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-    return jax.tree.map(pick, new, old)
+    return select_rows(taken, new, old)
