@@ -97,8 +97,8 @@ def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
 
     `mixtures` is a run of `run_filter(..., collect=None)`, whose first time is then x_0, or the
     mixtures that it collected, whose first time is x_1. Raises `ValueError` for anything else, and
-    where particles have no single ancestors, as after restarts (index -1; RuntimeError within jit). Use it to see how
-    far back the history of a mode goes. Resampling leaves few ancestors at early
+    where particles have no single ancestors, as after restarts (index -1; RuntimeError within jit).
+    Use it to see how far back the history of a mode goes. Resampling leaves few ancestors at early
     times; `sample_trajectories` draws new ones.
     """
     return _trace(with_parents(mixtures_of(mixtures), "trace_ancestors"))

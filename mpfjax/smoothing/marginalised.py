@@ -67,7 +67,7 @@ class Information(NamedTuple):
 def check_marginalised(
     model: Any, mixtures: ParticleMixture, observations: Any, method: str
 ) -> ParticleMixture:
-    """The mixtures; a `ValueError` for restarts, and for data that backward sampling of latents cannot use."""
+    """The mixtures; a `ValueError` for restarts, and for data that backward sampling cannot use."""
     if not is_marginalised(model) or observations is None or method != "exact":
         raise ValueError("observations, method: y is for conditionally linear models, by 'exact'")
     lengths = {jnp.shape(leaf)[0] for leaf in jax.tree.leaves(observations)}

@@ -67,8 +67,8 @@ def smoothed_sums(
     trajectories that end in it. Some particles J of step t - 1 are drawn by the backward kernel,
     W_{t-1}^J D(x_t^i | x_{t-1}^J), and τ_t^i is the mean of τ_{t-1}^J + h(x_{t-1}^J, x_t^i) over
     them. The estimate is Σ_i W_t^i τ_t^i. W are joint weights, so this holds for a mixture too: a
-    particle may come from another component, and with restarts from anywhere. Times Ẑ, it is unbiased if Ẑ is. The filter's run is
-    that of `run_filter` with the same key.
+    particle may come from another component, and with restarts from anywhere. Times Ẑ, it is
+    unbiased if Ẑ is. The filter's run is that of `run_filter` with the same key.
 
     - `function`: h. It takes x_{t-1} and x_t of n particles, leaves (n, ...), and returns values of
       each, leaves (n, ...); of one particle if the model is wrapped by `per_particle`.
