@@ -6,14 +6,14 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count, checked, kinds, shown
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, replaced, with_inputs
 from mpfjax.models.noise import Noise
 from mpfjax.models.observations import Fault, faults_of, one_input, one_observation, raise_faults
-from mpfjax.moves.alarm import with_evidence_against
+from mpfjax.moves.alarm import hearing
 from mpfjax.moves.base import (
     AbstractMove,
     AbstractPropagation,
@@ -60,6 +60,7 @@ class Filter(eqx.Module):
     num_particles: int = eqx.field(static=True)
     num_components: int = eqx.field(static=True)
     initial_noise: Noise = eqx.field(static=True)
+    _keeps_parents: bool = eqx.field(static=True, init=False)
 
     @checked
     def __init__(
@@ -76,6 +77,7 @@ class Filter(eqx.Module):
         self.initial_moves = as_moves(initial_moves, "initial_moves")
         self.num_particles, self.num_components = int(num_particles), int(num_components)
         self.initial_noise = initial_noise
+        self._keeps_parents = any(move.needs_parents for move in self.moves)
 
     def __check_init__(self) -> None:
         if self.num_particles < self.num_components:
@@ -89,7 +91,8 @@ class Filter(eqx.Module):
             move.check(now, self.num_particles, self.num_components)
         memory_of(self.moves, self.model, self.num_components)
         if self._keeps_parents:
-            first = next((t for t, m in enumerate(self.moves) if _propagates(m)), 0)
+            each = enumerate(self.moves)
+            first = next((t for t, move in each if isinstance(move, AbstractPropagation)), 0)
             check_keep_parents("moves", self.moves[first:], "another move")
 
     @property
@@ -100,12 +103,10 @@ class Filter(eqx.Module):
     @property
     def propagation(self) -> AbstractPropagationOfEach | None:
         """The move by which x_t of one particle is drawn and weighed without a look at others."""
-        each = (move for move in self.moves if isinstance(move, AbstractPropagationOfEach))
-        return next(each, None)
-
-    @property
-    def _keeps_parents(self) -> bool:
-        return any(move.needs_parents for move in self.moves)
+        for move in self.moves:
+            if isinstance(move, AbstractPropagationOfEach):
+                return move
+        return None
 
     @property
     def weighs_initially(self) -> bool:
@@ -210,36 +211,18 @@ class Filter(eqx.Module):
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
         for move_key, move in zip(split_keys(key, len(self.moves)), self.moves, strict=True):
-            moved = self._moved(move, move_key, mixture, now)
+            if self._keeps_parents and isinstance(move, AbstractPropagation):
+                mixture = mixture.with_parents()
+            moved = check_result(move(move_key, mixture, now), mixture, move)
             if observation is not None:
-                resampled |= self._resampled(move, mixture, now)
+                resampled |= move.would_resample(mixture, now)
                 if not move.keeps_mass:
                     moved, log_growth = moved.normalised(mixture)
                     increment += log_growth
             mixture = moved
-        evidence = self._evidence_against(mixture, now, increment)
-        mixture = with_evidence_against(mixture, evidence).replace(parents=None, in_order=False)
+        mixture = mixture.replace(parents=None, in_order=False)
+        mixture, evidence = hearing(self.moves, mixture, now, increment)
         return mixture, report_of(mixture, increment, resampled, evidence)
-
-    def _moved(
-        self, move: AbstractMove, key: Key[Array, ""], mixture: ParticleMixture, now: Step
-    ) -> ParticleMixture:
-        """The mixture after one move, checked."""
-        if _propagates(move) and mixture.parents is None and self._keeps_parents:
-            mixture = mixture.replace(parents=mixture.particles)
-        moved = check_result(move(key, mixture, now), mixture, move)
-        return moved.replace(in_order=False) if _propagates(move) else moved
-
-    def _resampled(
-        self, move: AbstractMove, mixture: ParticleMixture, now: Step
-    ) -> Bool[Array, " m"]:
-        """Which components of the mixture that move would resample."""
-        due = move.would_resample(mixture, now)
-        return due if mixture.waits is None else due & ~mixture.waits
-
-    def _evidence_against(self, mixture: ParticleMixture, now: Step, increment: Array) -> Any:
-        told = (move.evidence_against(mixture, now, increment) for move in self.moves)
-        return next((each for each in told if each is not None), None)
 
     def _step_and_faults(
         self,
@@ -266,10 +249,6 @@ _one_step = jit_with_floats_traced(Filter._step_and_faults)
 _start = jit_with_floats_traced(Filter._start_and_faults)
 
 
-def _propagates(move: AbstractMove) -> bool:
-    return isinstance(move, AbstractPropagation)
-
-
 def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: str) -> None:
     """Raise a `ValueError` that names a move after which particles have no single parents."""
     for move in all_of(moves):
@@ -283,10 +262,8 @@ def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> Pa
     who = f"moves: {name_of(move)} returned"
     if not isinstance(moved, ParticleMixture):
         raise ValueError(f"{who} {shown(moved)}, no ParticleMixture")
-    given, returned = (
-        kinds((each.particles, each.log_weights, each.component_indicators))
-        for each in (mixture, moved)
-    )
+    given = kinds((mixture.particles, mixture.log_weights, mixture.component_indicators))
+    returned = kinds((moved.particles, moved.log_weights, moved.component_indicators))
     if returned != given:
         raise ValueError(f"{who} {returned}, and was given {given}")
     return moved

@@ -366,6 +366,10 @@ class ParticleMixture(eqx.Module):
             own += self.num_particles * island_index()
         return self.replace(ancestor_indices=own)
 
+    def with_parents(self) -> "ParticleMixture":
+        """The mixture that keeps x_{t-1}, before a propagation; as it is if it keeps it already."""
+        return self if self.parents is not None else self.replace(parents=self.particles)
+
     def at(self, slots: Int[Array, " k"]) -> "ParticleMixture":
         """The particles of these slots, with all that belongs to them.
 

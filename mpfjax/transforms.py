@@ -12,6 +12,7 @@ from mpfjax.moves.base import (
     AbstractPropagation,
     AbstractPropagationOfEach,
     AbstractRegrouping,
+    all_of,
 )
 from mpfjax.moves.initial import SelectInitial, require_propagation
 from mpfjax.moves.propagation.nested import PropagateNested
@@ -20,7 +21,7 @@ from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.moves.restarts import RegroupOthers, Restart, WatchStart, plain_resample
+from mpfjax.moves.restarts import RegroupOthers, Restart, WatchStart
 
 
 @checked
@@ -32,16 +33,20 @@ def map_moves(change: Callable[[Any], Any], filter: Filter) -> Filter:
 
         map_moves(lambda m: Resample("ssp") if isinstance(m, Resample) else m, filter)
     """
-    return _changed(change, filter, lambda move: True)
+    return _changed(change, filter, within=True)
 
 
-def _changed(
-    change: Callable[[Any], Any], filter: Filter, enters: Callable[[AbstractMove], bool]
-) -> Filter:
-    """The filter with its moves changed, and before them those held by moves that it enters."""
+def _map_chain(change: Callable[[Any], Any], filter: Filter) -> Filter:
+    """The same of the chain's own moves alone, not of those that propagations hold."""
+    return _changed(change, filter, within=False)
+
+
+def _changed(change: Callable[[Any], Any], filter: Filter, within: bool) -> Filter:
+    """The filter with its moves changed, those that they hold first, also `within` propagations."""
 
     def changed(move: AbstractMove) -> Any:
-        return change(move.map_inner(changed) if enters(move) else move)
+        enters = within or not isinstance(move, AbstractPropagation)
+        return change(move.map_inner(changed) if enters else move)
 
     return filter.replace(
         moves=[changed(move) for move in filter.moves],
@@ -49,9 +54,10 @@ def _changed(
     )
 
 
-def _map_chain(change: Callable[[Any], Any], filter: Filter) -> Filter:
-    """The same of the chain's own moves alone, not of those that propagations hold."""
-    return _changed(change, filter, lambda move: not isinstance(move, AbstractPropagation))
+def _require_resample(filter: Filter, what: str) -> None:
+    """Raise a `ValueError` for a filter whose chain does not resample by a `Resample`."""
+    if not any(isinstance(move, Resample) for move in all_of(filter.moves, within=False)):
+        raise ValueError(f"filter: none of its moves is a Resample, {what}")
 
 
 @checked
@@ -122,8 +128,7 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
     """
     plain = _map_chain(lambda m: m.resample if isinstance(m, AuxiliaryResample) else m, filter)
     look = PilotLookahead() if lookahead is None else lookahead
-    if not any(map(plain_resample, plain.moves)):
-        raise ValueError("filter: none of its moves is a Resample, which could look ahead")
+    _require_resample(plain, "which could look ahead")
 
     def ahead(move: Any) -> Any:
         if isinstance(move, Resample):
@@ -162,21 +167,33 @@ def with_restarts(
     """The filter that finds a state again which begins anew with a small probability: `Restart`.
 
     At each step x_{t-1} ~ (1 - p) δ + p p_0, and Ẑ is unbiased for this kernel. Draws of x_0 have a
-    component of their own, one more than the filter has, which its regrouping leaves alone. Raises
-    `ValueError` for a filter that does not resample all components at each step by a `Resample`.
-    Use it where a hypothesis may be wrong for good: a robot that is carried away, a lost target.
+    component of their own, one more than the filter has, which its regrouping leaves alone. They
+    are an alarm as well, in the place of that of `with_alarm`. Of a filter with restarts it changes
+    the settings. Raises `ValueError` for a filter that does not resample all components at each
+    step by a `Resample`. Use it where a hypothesis may be wrong for good: a robot that is carried
+    away, a lost target.
     """
-    if not any(map(plain_resample, filter.moves)):
-        raise ValueError("filter: none of its moves is a Resample, with which a state begins anew")
+    _require_resample(filter, "with which a state begins anew")
+    settings = {"probability": probability, "share": share, "num_draws": num_draws}
+
+    def changed(move: Any) -> Any:
+        return dataclasses.replace(move, **settings) if isinstance(move, Restart) else move
 
     def restarting(move: Any) -> Any:
-        return Restart(move, probability, share, num_draws) if plain_resample(move) else move
+        is_own = isinstance(move, Resample | AuxiliaryResample)
+        return Restart(move, **settings) if is_own else _apart(move)
 
+    if _has(filter, Restart):
+        return _map_chain(changed, filter)
     return filter.replace(
-        moves=[restarting(_apart(move)) for move in filter.moves],
+        moves=[restarting(move) for move in filter.moves if not isinstance(move, WatchStart)],
         initial_moves=[_apart(move) for move in filter.initial_moves],
         num_components=filter.num_components + 1,
     )
+
+
+def _has(filter: Filter, kind: type) -> bool:
+    return any(isinstance(move, kind) for move in filter.moves)
 
 
 def _apart(move: Any) -> Any:
@@ -191,10 +208,13 @@ def with_alarm(filter: Filter, num_draws: Count = 4096) -> Filter:
     """The filter that says when all its hypotheses seem wrong: `FilterRun.surprised`.
 
     At each step the increment is compared with the evidence for a state that begins anew: draws of
-    x_0, made once, which cost as much as so many particles of a plain filter. `with_restarts` has
-    the same evidence from its own draws. Use it where a lost target must be noticed.
+    x_0, made once, which cost as much as so many particles of a plain filter. A filter
+    of `with_restarts` has the same evidence from its own draws, and stays as it is. Use it where a lost target must be noticed.
     """
-    return filter.replace(moves=[*filter.moves, WatchStart(num_draws)])
+    if _has(filter, Restart):
+        return filter
+    others = [move for move in filter.moves if not isinstance(move, WatchStart)]
+    return filter.replace(moves=[*others, WatchStart(num_draws)])
 
 
 def _everywhere(filter: Filter, field: str, value: str) -> Filter:

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import Moves, Step
 from mpfjax.operations.islands import num_islands, over_islands
 from mpfjax.operations.logarithms import log_sum_exp
 
@@ -23,19 +24,22 @@ def is_alarmed(mixture: ParticleMixture) -> Bool[Array, ""]:
     return mixture.memory[SURPRISE] > ALARM
 
 
-def with_evidence_against(
-    mixture: ParticleMixture, evidence: Float[Array, ""] | None
-) -> ParticleMixture:
-    """The mixture whose alarm has heard the evidence of one more step.
+def hearing(
+    moves: Moves, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
+) -> tuple[ParticleMixture, Float[Array, ""] | None]:
+    """The mixture whose alarm has heard of one more step, and what a move told it, if one does.
 
     The sum is bounded, so that it ends soon after the hypotheses are right again, and so is what
     one step can tell: an impossible one is not for ever.
     """
-    if evidence is None:
-        return mixture
-    told = jnp.clip(jnp.where(jnp.isnan(evidence), 0.0, evidence), -2 * ALARM, 2 * ALARM)
-    total = jnp.clip(mixture.memory[SURPRISE] + told, 0.0, 2 * ALARM)
-    return mixture.replace(memory=mixture.memory | {SURPRISE: total})
+    for move in moves:
+        evidence = move.evidence_against(mixture, now, increment)
+        if evidence is not None:
+            told = jnp.where(jnp.isnan(evidence), 0.0, evidence)
+            total = mixture.memory[SURPRISE] + jnp.clip(told, -2 * ALARM, 2 * ALARM)
+            memory = mixture.memory | {SURPRISE: jnp.clip(total, 0.0, 2 * ALARM)}
+            return mixture.replace(memory=memory), evidence
+    return mixture, None
 
 
 def over_all_islands(log_value: Float[Array, ""]) -> Float[Array, ""]:

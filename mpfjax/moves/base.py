@@ -108,8 +108,11 @@ class AbstractMove(Given):
     @property
     def inner(self) -> "Moves":
         """The moves that it runs."""
-        fields = (getattr(self, name) for name in self.holds)
-        return tuple(m for held in fields for m in (held if isinstance(held, tuple) else (held,)))
+        moves: Moves = ()
+        for name in self.holds:
+            held = getattr(self, name)
+            moves += held if isinstance(held, tuple) else (held,)
+        return moves
 
     def map_inner(self, change: Callable[[Any], Any]) -> Any:
         """The move with `change(move)` in the place of each move that it runs."""
@@ -156,10 +159,11 @@ def name_of(move: AbstractMove) -> str:
     return getattr(function, "__name__", type(function).__name__)
 
 
-def all_of(moves: Iterable[AbstractMove]) -> Iterator[AbstractMove]:
-    """The moves, and before each of them those that it runs."""
+def all_of(moves: Iterable[AbstractMove], within: bool = True) -> Iterator[AbstractMove]:
+    """The moves, and before each of them those that it runs, also `within` a propagation."""
     for move in moves:
-        yield from all_of(move.inner)
+        if within or not isinstance(move, AbstractPropagation):
+            yield from all_of(move.inner, within)
         yield move
 
 
@@ -316,8 +320,10 @@ class AbstractWrapper(AbstractMove):
 
     def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
         """Which components of `mixture` any of the moves would resample."""
-        due = [move.would_resample(mixture, now) for move in self.inner]
-        return jnp.any(jnp.stack(due), axis=0)
+        due = jnp.zeros(mixture.num_components, bool)
+        for move in self.inner:
+            due |= move.would_resample(mixture, now)
+        return due
 
     def initial_memory(
         self, model: AbstractStateSpaceModel, num_components: int
@@ -333,5 +339,7 @@ class AbstractWrapper(AbstractMove):
         self, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
     ) -> Float[Array, ""] | None:
         """That of the first of the moves that has it."""
-        told = (move.evidence_against(mixture, now, increment) for move in self.inner)
-        return next((each for each in told if each is not None), None)
+        for move in self.inner:
+            if (told := move.evidence_against(mixture, now, increment)) is not None:
+                return told
+        return None

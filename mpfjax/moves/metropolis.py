@@ -33,8 +33,8 @@ class _Target(NamedTuple):
 
     def __call__(self, states: PyTree) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """log D and log L, separately: with a large constant in L, their sum loses digits of D."""
-        log_likelihood = likelihoods(target.model, self.observation, states)
-        return log_transition(target.model, states, self.parents), log_likelihood
+        log_likelihood = likelihoods(self.model, self.observation, states)
+        return log_transition(self.model, states, self.parents), log_likelihood
 
     def ratio(self, new: tuple[Array, Array], old: tuple[Array, Array]) -> Float[Array, " n"]:
         """log π(x') - log π(x)."""

@@ -115,14 +115,15 @@ class Resample(AbstractResampling):
     ) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
         del now
-        if self.ess_threshold == 1.0:
-            return mixture.active
-        counts = mixture.component_counts
-        least = self.ess_threshold * counts.astype(mixture.log_weights.dtype)
-        due = mixture.component_effective_sample_sizes < least
-        if self.particles_per_component is not None:
-            due = due | (counts != self.particles_per_component)
-        return due & (counts > 0)
+        due = mixture.active
+        if self.ess_threshold < 1.0:
+            counts = mixture.component_counts
+            least = self.ess_threshold * counts.astype(mixture.log_weights.dtype)
+            is_poor = mixture.component_effective_sample_sizes < least
+            if self.particles_per_component is not None:
+                is_poor |= counts != self.particles_per_component
+            due = is_poor & (counts > 0)
+        return due if mixture.waits is None else due & ~mixture.waits
 
     def resample(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """The mixture with every component resampled that is due."""
