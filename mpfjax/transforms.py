@@ -208,8 +208,9 @@ def with_alarm(filter: Filter, num_draws: Count = 4096) -> Filter:
     """The filter that says when all its hypotheses seem wrong: `FilterRun.surprised`.
 
     At each step the increment is compared with the evidence for a state that begins anew: draws of
-    x_0, made once, which cost as much as so many particles of a plain filter. A filter
-    of `with_restarts` has the same evidence from its own draws, and stays as it is. Use it where a lost target must be noticed.
+    x_0, the same at each step, which cost as much as so many particles of a plain filter. A filter
+    of `with_restarts` has the same evidence from its own draws, and stays as it is. Use it where a
+    lost target must be noticed.
     """
     if _has(filter, Restart):
         return filter

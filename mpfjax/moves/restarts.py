@@ -98,11 +98,10 @@ class Restart(AbstractWrapper):
         key_resample, key_drawn, key_look, key_chosen = split(key, 4)
         usable, last = mixture.num_usable_slots, mixture.num_components - 1
         room = self._most_slots(mixture.num_particles)
-        if mixture.usable_slots is None:
-            most = jnp.asarray(room, jnp.int32)
-        else:
-            most = jnp.maximum(1, jnp.round(self.share * usable)).astype(jnp.int32)
-        least = jnp.maximum(1, jnp.round(QUIET_PART * most)).astype(jnp.int32)
+        # Of a part of the slots, where only a part may be used.
+        share = jnp.asarray(usable, jnp.float32) / mixture.num_particles
+        most = jnp.maximum(1, jnp.round(room * share)).astype(jnp.int32)
+        least = jnp.maximum(1, jnp.round(QUIET_PART * room * share)).astype(jnp.int32)
         number = jnp.where(is_alarmed(mixture), most, least)
 
         survivors = self._resampled(

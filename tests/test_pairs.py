@@ -1,0 +1,95 @@
+"""All pairs of transforms, by Ẑ and the mean, beside Kalman filters; also on islands.
+
+The model is linear and Gaussian, with a step that has no observation. Where states begin anew, the
+exact answer is the mixture of Kalman filters over all histories of when they did.
+"""
+
+import itertools
+from functools import cache
+
+import jax
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax import KMeans, Propagate, Resample
+from tests.marking import quick_of
+from tests.unbiased import assert_unbiased
+from tests.user_models import ScalarLinear
+
+A, Q, R, M0, P0 = 0.9, 0.6, 0.5, 0.5, 1.0
+MODEL = ScalarLinear(a=A, q=Q, r=R, m=M0, p=P0)
+OBSERVATIONS = np.array([0.6, np.nan, -1.1, 1.2], np.float32)
+PROBABILITY = 0.2
+TRANSFORMS = {
+    "point sets": mpfjax.with_point_sets,
+    "look-ahead": mpfjax.with_lookahead,
+    "two draws": lambda filter: mpfjax.with_proposals_per_particle(filter, 2),
+    "start": lambda filter: mpfjax.with_selected_start(filter, 4),
+    "restarts": lambda filter: mpfjax.with_restarts(filter, PROBABILITY),
+    "alarm": lambda filter: mpfjax.with_alarm(filter, 16),
+    "stratified": lambda filter: mpfjax.with_resampling(filter, Resample("stratified")),
+}
+NUM_RUNS, NUM_ISLANDS = 1500, 2
+# In either order on one device, and in one on islands.
+PAIRS = [(*pair, 1) for pair in itertools.permutations(TRANSFORMS, 2)]
+PAIRS += [("restarts", "restarts", 1), ("alarm", "alarm", 1)]
+PAIRS += [(*pair, NUM_ISLANDS) for pair in itertools.combinations(TRANSFORMS, 2)]
+# Each kind of fault that there was: looks ahead, starts and islands beside restarts.
+QUICK = [("look-ahead", "restarts", 1), ("start", "look-ahead", 1), ("start", "restarts", 2)]
+
+
+@cache
+def exact(restarts):
+    """Z and E[x_t | y] by Kalman filters, one for each history of restarts."""
+    total, first = 0.0, 0.0
+    for history in itertools.product((False, True), repeat=len(OBSERVATIONS) if restarts else 0):
+        history = history or [False] * len(OBSERVATIONS)
+        mean, variance, weight = M0, P0**2, 1.0
+        for began, y in zip(history, OBSERVATIONS.astype(float), strict=True):
+            if restarts:
+                weight *= PROBABILITY if began else 1 - PROBABILITY
+            mean, variance = (M0, P0**2) if began else (mean, variance)
+            mean, variance = A * mean, A**2 * variance + Q**2
+            if np.isnan(y):
+                continue
+            spread = variance + R**2
+            weight *= np.exp(-0.5 * (y - mean) ** 2 / spread) / np.sqrt(2 * np.pi * spread)
+            mean, variance = mean + variance / spread * (y - mean), variance * R**2 / spread
+        total, first = total + weight, first + weight * mean
+    return total, first / total
+
+
+def filter_of(pair):
+    filter = mpfjax.Filter(
+        MODEL, [Resample(), Propagate(), KMeans(1)], 40, 2, initial_moves=[KMeans(1, reseed=True)]
+    )
+    for name in pair:
+        filter = TRANSFORMS[name](filter)
+    return filter
+
+
+def mean_of(mixture):
+    return mixture.average(mixture.particles)
+
+
+@pytest.mark.filterwarnings("ignore:at the end, what was observed")
+@pytest.mark.parametrize(("first", "second", "islands"), quick_of(PAIRS, QUICK))
+def test_evidence_and_mean_are_exact(first, second, islands):
+    pair = first, second
+    filter, series = filter_of(pair), mpfjax.Series.skipping(OBSERVATIONS)
+    keys = jax.random.split(jax.random.key(0), NUM_RUNS)
+
+    def run_islands(key):
+        return mpfjax.run_islands(key, filter, series, mean_of, num_islands=NUM_ISLANDS)
+
+    if islands == 1:
+        run = mpfjax.monte_carlo(keys, filter, series, mean_of)
+        means = run.collected[:, -1]
+    else:
+        run = jax.jit(jax.vmap(run_islands))(keys)
+        means = run.collected[:, -1].sum(axis=1)
+    evidence, mean = exact("restarts" in pair)
+    ratios = np.exp(np.asarray(run.log_marginal_likelihood)) / evidence
+    assert_unbiased(ratios, loosest=0.03)
+    assert_unbiased(ratios * np.asarray(means), mean, loosest=0.03)
