@@ -128,7 +128,7 @@ class NetworkProposal(_GaussianProposal):
     ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
         """The mean and deviations of every particle's Gaussian."""
         previous = previous_states.reshape(previous_states.shape[0], -1)
-        seen = ravel_pytree(observation)[0].astype(previous.dtype)
+        seen = ravel_pytree(now.observation)[0].astype(previous.dtype)
         rows = jnp.broadcast_to(seen, (previous.shape[0], seen.shape[0]))
         outputs = jax.vmap(self.network)(jnp.concatenate([previous, rows], axis=1))
         shifts, log_widths = jnp.split(outputs, 2, axis=1)
