@@ -6,9 +6,7 @@ move or filter is one new line below; the tests then find it.
 """
 
 from collections.abc import Callable
-from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -34,6 +32,7 @@ from mpfjax import (
     Resample,
     Split,
 )
+from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 
@@ -97,11 +96,11 @@ def _mpf(m: int = NUM_COMPONENTS, **options) -> Callable[..., Filter]:
 
 
 def _chain(
-    *before, m: int = NUM_COMPONENTS, then=(), proposal=lambda model: None
+    *before, m: int = NUM_COMPONENTS, then=(), proposal=None
 ) -> Callable[..., Filter]:
     return lambda model: Filter(
         model,
-        [*before, Propagate(proposal(model)), *then],
+        [*before, Propagate(proposal), *then],
         NUM_PARTICLES,
         m,
         initial_moves=[KMeans(3, reseed=True)],
@@ -128,14 +127,12 @@ def _metropolis(m: int) -> Callable[..., Filter]:
     return make
 
 
-class Halfway(eqx.Module):
+class Halfway(AbstractLookahead):
     """The root of the likelihood of the mean: a look-ahead with tails that are not too thin."""
 
-    model: Any
-
-    def __call__(self, observation, states):
-        mean = self.model.transition_mean(states)
-        return 0.5 * self.model.log_likelihood(observation, mean)
+    def log_factors(self, mixture, now):
+        mean = now.model.transition_mean(mixture.particles)
+        return 0.5 * now.model.log_likelihood(now.observation, mean)
 
 
 def _joint(make: Callable[[MultiObjectModel], Filter]) -> Callable[..., Filter]:
@@ -153,17 +150,17 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
     return {
         "mpf": _mpf(m),
         "mpf rqmc": _mpf(m, noise="rqmc"),
-        "guided mpf rqmc, adaptive": lambda model: _mpf(
+        "guided mpf rqmc, adaptive": _mpf(
             m, proposal=GaussNewtonProposal(), noise="rqmc", ess_threshold=0.5
-        )(model),
+        ),
         "gaussian mixture rqmc": lambda model: mpfjax.with_point_sets(
             mpfjax.gaussian_mixture_particle_filter(model, NUM_PARTICLES, m)
         ),
-        "guided mpf": lambda model: _mpf(m, proposal=GaussNewtonProposal())(model),
+        "guided mpf": _mpf(m, proposal=GaussNewtonProposal()),
         "guided, sorted": _chain(
             Resample(sort_by=lambda states: states.reshape(NUM_PARTICLES, -1)[:, 0]),
             m=m,
-            proposal=GaussNewtonProposal,
+            proposal=GaussNewtonProposal(),
             then=[KMeans(2)],
         ),
         "patient merge": _chain(Resample(), m=m, then=[Merge(2.0, 1.0, patience=2)]),
@@ -201,8 +198,8 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "auxiliary pf, adaptive": lambda model: mpfjax.auxiliary_particle_filter(
         model, NUM_PARTICLES, GaussNewtonProposal(), ess_threshold=0.5
     ),
-    "auxiliary mpf": lambda model: mpfjax.with_lookahead(_mpf()(model), Halfway(model)),
-    "guided pf": lambda model: _pf(proposal=GaussNewtonProposal())(model),
+    "auxiliary mpf": lambda model: mpfjax.with_lookahead(_mpf()(model), Halfway()),
+    "guided pf": _pf(proposal=GaussNewtonProposal()),
     **_of_components(NUM_COMPONENTS),
     **{
         f"{name}, M = {MANY_COMPONENTS}": chain
@@ -211,9 +208,9 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     },
     "metropolis": _metropolis(1),
     "mixture with metropolis": _metropolis(NUM_COMPONENTS),
-    "every second step a random walk": lambda model: _chain(
+    "every second step a random walk": _chain(
         Resample(), then=[Every(2, [RandomWalkMetropolis()])]
-    )(model),
+    ),
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
     "guided mpf rqmc of families": lambda model: mpfjax.with_proposals_per_particle(
         _mpf(proposal=GaussNewtonProposal(), noise="rqmc")(model), 3

@@ -37,7 +37,7 @@ def test_a_step_weighs_by_the_likelihood_times_the_dynamics_over_the_proposal(mo
     All K factors of a particle are this, and so is their mean.
     """
     before = make_mixture(STATES, 0.3 * np.arange(24), np.zeros(24), 1)
-    after = eqx.filter_jit(move)(jax.random.key(0), before, jnp.array(0.7))
+    after = eqx.filter_jit(move)(jax.random.key(0), before, mpfjax.Step(MODEL, jnp.array(0.7)))
     expected = np.asarray(before.log_weights) + NORMAL(0.7, 0.9 * STATES, np.hypot(0.6, 0.5))
     found = np.asarray(after.log_weights) + np.asarray(after.log_scale)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
@@ -59,9 +59,9 @@ def test_many_metropolis_steps_leave_the_target_as_it_is(move):
     states = mean + np.sqrt(variance) * rng.normal(size=n)
     mixture = make_mixture(states, np.zeros(n), np.zeros(n), 1)
     mixture = mixture.replace(parents=jnp.asarray(parents, jnp.float32))
-    start, two_steps = mixture.particles, eqx.filter_jit(move(model, 2, least_step=0.5))
+    start, two_steps = mixture.particles, eqx.filter_jit(move(2, least_step=0.5))
     for key in jax.random.split(jax.random.key(1), 6):
-        mixture = two_steps(key, mixture, jnp.array(y))
+        mixture = two_steps(key, mixture, mpfjax.Step(model, jnp.array(y)))
     residuals = (np.asarray(mixture.particles, float) - mean) / np.sqrt(variance)
     assert np.mean(np.asarray(mixture.particles) != np.asarray(start)) > 0.6
     assert abs(residuals.mean()) < 4 / np.sqrt(n)
@@ -79,8 +79,9 @@ def test_prior_masses_of_dps_are_those_of_the_living_and_the_total_is_the_eviden
         log_weights = np.where(labels == dead, -np.inf, before.log_weights)
         before = before.replace(log_weights=jnp.asarray(log_weights, jnp.float32))
     model = MultiObjectModel(ScalarLinear(), 2, shared_observation=True)
+    now = mpfjax.Step(model, jnp.array(0.5))
     prior, evidence = (
-        eqx.filter_jit(Partitioned(reassembly=name))(jax.random.key(0), before, 0.5)
+        eqx.filter_jit(Partitioned(reassembly=name))(jax.random.key(0), before, now)
         for name in ("prior", "evidence")
     )
     shares = np.exp(np.asarray(before.log_mixture_weights, float))

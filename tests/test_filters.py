@@ -81,7 +81,10 @@ def test_three_methods_are_enough_for_any_pytree_of_states_and_observations():
 
 
 def test_a_move_may_be_any_function():
-    def temper(key, mixture, observation):
+    given = []
+
+    def temper(key, mixture, now):
+        given.append(now)
         return mixture.replace(log_weights=mixture.log_weights - 0.5)
 
     plain = Filter(QUADRATIC, [Resample(), Propagate()], 48)
@@ -90,14 +93,16 @@ def test_a_move_may_be_any_function():
     ours, theirs = (mpfjax.run_filter(KEY, f, OBSERVATIONS) for f in (custom, plain))
     expected = theirs.log_likelihood_increments - 0.5
     np.testing.assert_allclose(ours.log_likelihood_increments, expected, rtol=1e-5)
-    with pytest.raises(ValueError, match=r"moves: .* does not define predict"):
-        custom.predict(KEY, custom.init(KEY))
+    custom.predict(KEY, custom.init(KEY))
+    assert isinstance(given[0].observation, jax.Array)
+    assert given[-1].observation is None  # where y_t is missing it is called all the same
+    assert given[-1].propagation.noise == "independent"
 
 
 def test_the_mass_of_a_mixture_given_by_hand_counts_once_whatever_moves_leave_the_weights():
     """A move that returns the weights that it was given is not normalised again."""
 
-    def learns(key, mixture, observation):
+    def learns(key, mixture, now):
         return mixture
 
     for moves in ([Propagate(), learns, Resample()], [learns, Propagate()]):
@@ -184,11 +189,13 @@ class TestParameters:
             assert len(parameters) == len(jax.tree.leaves(model)) == 2, chain
 
     def test_changing_the_filters_model_changes_its_moves(self):
-        filter = CHAINS["guided mpf"](mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0))
+        """Of the dynamics and of the guide: as if the filter had been made for the other model."""
+        make = CHAINS["guided mpf"]
+        filter = make(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0))
         wider = eqx.tree_at(lambda f: f.model.sigma_x, filter, jnp.array(0.7))
-        propagate = next(move for move in wider.moves if isinstance(move, Propagate))
-        for held in (propagate.model, propagate.proposal.model):
-            assert float(held.sigma_x) == pytest.approx(0.7)
+        made = make(mpfjax.QuadraticModel(jnp.array(0.7), 0.5, -2.0, 2.0))
+        found, expected = (mpfjax.run_filter(KEY, f, OBSERVATIONS[:2]) for f in (wider, made))
+        chex.assert_trees_all_equal(found, expected)
 
 
 WALKS_TRACED = []

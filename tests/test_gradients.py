@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax import Filter, Propagate, Resample, with_score_gradient
+from mpfjax import Filter, Propagate, Resample, Step, with_score_gradient
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from tests.examples import example_mixtures
@@ -36,11 +36,10 @@ def guided(model):
 
 
 def own(*moves):
-    return lambda model: Filter(model, [make(model) for make in moves], NUM_PARTICLES)
+    return lambda model: Filter(model, moves, NUM_PARTICLES)
 
 
-def resample(model):
-    return Resample("multinomial", 0.5)
+RESAMPLE = Resample("multinomial", 0.5)
 
 
 def pathwise(model):
@@ -52,13 +51,13 @@ WITH_GAP = ONE.at[1].set(jnp.nan)
 # A filter, before its gradient is chosen, and the observations.
 FILTERS = {
     "mpf": (single(mpfjax.mixture_particle_filter, 2, ess_threshold=0.7), ONE),
-    "langevin": (own(Propagate, resample, mpfjax.MetropolisAdjustedLangevin), ONE),
+    "langevin": (own(Propagate(), RESAMPLE, mpfjax.MetropolisAdjustedLangevin()), ONE),
     "pf": (single(mpfjax.particle_filter), ONE),
     "mpf rqmc": (single(mpfjax.mixture_particle_filter, 2, noise="rqmc"), ONE),
     "guided pf": (guided, ONE),
     "pathwise": (pathwise, ONE),
-    "walk": (own(Propagate, resample, mpfjax.RandomWalkMetropolis), ONE),
-    "halves, one missing": (own(resample, Predict, Reweight), WITH_GAP),
+    "walk": (own(Propagate(), RESAMPLE, mpfjax.RandomWalkMetropolis()), ONE),
+    "halves, one missing": (own(RESAMPLE, Predict(), Reweight()), WITH_GAP),
     "ps": (joint(mpfjax.partitioned_sampling, order=(1, 0)), TWO),
     "dps": (
         joint(
@@ -119,11 +118,12 @@ MOVES = {
 
 @pytest.mark.parametrize("kind", MOVES)
 def test_moves_with_stopped_gradients_are_the_same_to_the_bit(kind):
+    now = Step(MODEL, ONE[0, 0])
     for mixture in example_mixtures().values():
         one_dimensional = mixture.replace(particles=mixture.particles[:, 0])
         chex.assert_trees_all_equal(
             *(
-                eqx.filter_jit(MOVES[kind](gradient))(jax.random.key(5), one_dimensional, ONE[0, 0])
+                eqx.filter_jit(MOVES[kind](gradient))(jax.random.key(5), one_dimensional, now)
                 for gradient in ("none", "stop")
             )
         )

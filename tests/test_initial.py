@@ -153,15 +153,14 @@ def test_derivatives_of_a_wide_prior_are_those_of_its_draws_or_density(kind):
 def test_what_a_chain_weighs_before_it_propagates_counts():
     """x_0 is seen once more, with an error of 2, by a move at the head of the chain."""
 
-    def tilt(key, mixture, observation):
-        log_factors = jax.scipy.stats.norm.logpdf(observation, mixture.particles, 2.0)
+    def tilt(key, mixture, now):
+        log_factors = jax.scipy.stats.norm.logpdf(now.observation, mixture.particles, 2.0)
         return mixture.weighed(log_factors)
 
     model, observation = ScalarLinear(a=1.0, q=0.3, r=0.3, m=0.0, p=3.0), 1.5
-    propagate = mpfjax.Propagate()
     filter = mpfjax.Filter(
-        model, [tilt, mpfjax.Resample(), propagate], 200,
-        initial_moves=[SelectInitial(propagate, 8)],
+        model, [tilt, mpfjax.Resample(), mpfjax.Propagate()], 200,
+        initial_moves=[SelectInitial(8)],
     )  # fmt: skip
     keys = jax.random.split(KEY, 400)
     found = mpfjax.monte_carlo(keys, filter, np.array([observation], np.float32), nothing)
@@ -188,7 +187,7 @@ def test_where_x_0_must_be_a_plain_draw_it_is_one():
     same = conditional_filter(KEY, make(1), OBSERVATIONS, trajectory)
     np.testing.assert_array_equal(found.trajectory, same.trajectory)
     chosen = make(8, scheme="multinomial")
-    assert not with_first_ancestors(chosen).looks_at_first
+    assert not with_first_ancestors(chosen).weighs_initially
 
 
 def test_impossible_and_empty_particles():

@@ -16,6 +16,7 @@ from jax.scipy.stats import norm
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
+from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.smoothing import sample_trajectories, smoothed_sums
 from tests.marking import exactness, quick_of
 from tests.unbiased import assert_unbiased, ratios_to
@@ -192,9 +193,12 @@ def built_in(dt=0.5, u=1.0):
     return {"dt": jnp.asarray(dt), "u": jnp.asarray(u)}
 
 
-def look_ahead(model):
-    """A method of the model, which a move holds with the model in it."""
-    return eqx.Partial(lambda model, y, x: model.log_likelihood(y, model.transition_mean(x)), model)
+class LookAhead(AbstractLookahead):
+    """The likelihood of the mean, by the model at u_t."""
+
+    def log_factors(self, mixture, now):
+        mean = now.model.transition_mean(mixture.particles)
+        return now.model.log_likelihood(now.observation, mean)
 
 
 def of_objects(make):
@@ -206,26 +210,22 @@ def of_objects(make):
 
 def own_chain(*moves):
     def filter(inputs):
-        model = Driven(inputs=inputs)
-        return mpfjax.Filter(model, [mpfjax.Resample(), *[move(model) for move in moves]], 32)
+        return mpfjax.Filter(Driven(inputs=inputs), [mpfjax.Resample(), *moves], 32)
 
     return filter
 
 
 EVERYWHERE = {
     "guided mpf rqmc": lambda inputs: mpfjax.mixture_particle_filter(
-        (model := Driven(inputs=inputs)), 32, 2, noise="rqmc",
+        Driven(inputs=inputs), 32, 2, noise="rqmc",
         proposal=mpfjax.GaussNewtonProposal(),
     ),
     "look-ahead": lambda inputs: mpfjax.auxiliary_particle_filter(
-        (model := Driven(inputs=inputs)), 32, look_ahead(model)
+        Driven(inputs=inputs), 32, LookAhead()
     ),
-    "families": own_chain(lambda model: mpfjax.PropagateNested(mpfjax.Propagate(), 2)),
-    "stages": own_chain(lambda model: mpfjax.PropagateTempered()),
-    "a proposal with a model of its own": own_chain(
-        lambda model: mpfjax.Propagate(mpfjax.GaussNewtonProposal()
-        )
-    ),
+    "families": own_chain(mpfjax.PropagateNested(mpfjax.Propagate(), 2)),
+    "stages": own_chain(mpfjax.PropagateTempered()),
+    "a proposal": own_chain(mpfjax.Propagate(mpfjax.GaussNewtonProposal())),
     "ps": of_objects(lambda joint: mpfjax.partitioned_sampling(joint, 32)),
     "clusters": of_objects(
         lambda joint: mpfjax.clustered_particle_filter(joint, 32, start="together")
@@ -233,7 +233,7 @@ EVERYWHERE = {
 }  # fmt: skip
 
 
-QUICK = ["a proposal with a model of its own"]
+QUICK = ["a proposal"]
 
 
 @pytest.mark.parametrize("name", quick_of(EVERYWHERE, QUICK))

@@ -8,7 +8,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 import mpfjax
 from mpfjax import keep_programs
-from mpfjax.filter import step_and_faults
+from mpfjax.filter import Filter
 from tests.marking import exactness
 
 SETTINGS = [
@@ -60,7 +60,7 @@ def test_a_step_raises_of_what_it_saw_and_its_program_calls_nothing_back(transfo
     """No program with a call back into Python is kept for the next process."""
     filter = mpfjax.particle_filter(mpfjax.QuadraticModel(), 8)
     key, mixture = jax.random.key(0), filter.init(jax.random.key(0))
-    program = eqx.filter_jit(step_and_faults).lower(filter, key, mixture, jnp.ones(()))
+    program = eqx.filter_jit(Filter._step_and_faults).lower(filter, key, mixture, jnp.ones(()))
     assert "callback" not in program.as_text()
     step = transformed(lambda observation: filter.step(key, mixture, observation))
     assert step(jnp.ones(()))[0].num_particles == 8

@@ -23,12 +23,13 @@ LINEAR = mpfjax.LinearGaussianModel(
     P0=np.eye(3),
 )
 OBSERVATION = jnp.array([1.0, -0.3])
+NOW = mpfjax.Step(LINEAR, OBSERVATION)
 PREVIOUS = jnp.asarray(np.random.default_rng(0).normal(size=(20, 3)), jnp.float32)
 
 
 @eqx.filter_jit
-def propose(proposal, key, observation, previous):
-    return proposal.propose(key, observation, previous)
+def propose(proposal, key, now, previous):
+    return proposal.propose(key, now, previous)
 
 
 def gaussian_fit(previous, observation):
@@ -43,21 +44,21 @@ def gaussian_fit(previous, observation):
 
 def test_the_log_density_is_that_of_the_gaussian_it_draws_from():
     proposal = GaussNewtonProposal(inflation=1.3)
-    states, log_density = propose(proposal, jax.random.key(1), OBSERVATION, PREVIOUS)
+    states, log_density = propose(proposal, jax.random.key(1), NOW, PREVIOUS)
     means, covariance = gaussian_fit(PREVIOUS, OBSERVATION)
     expected = [
         scipy.stats.multivariate_normal(mean, 1.3**2 * covariance).logpdf(state)
         for mean, state in zip(means, np.asarray(states), strict=True)
     ]
     np.testing.assert_allclose(log_density, expected, rtol=1e-3, atol=1e-3)
-    other = proposal.log_density(OBSERVATION, states, PREVIOUS)
+    other = proposal.log_density(NOW, states, PREVIOUS)
     np.testing.assert_allclose(log_density, other, rtol=1e-3, atol=1e-3)
 
 
 def test_on_a_linear_model_the_weight_is_the_normaliser_whatever_is_drawn():
     """The locally optimal proposal: L D / q is p(y_t | x_{t-1}), which SciPy knows."""
     proposal = GaussNewtonProposal(inflation=1.0, num_iterations=1)
-    states, log_density = propose(proposal, jax.random.key(3), OBSERVATION, PREVIOUS)
+    states, log_density = propose(proposal, jax.random.key(3), NOW, PREVIOUS)
     weights = LINEAR.log_likelihood(OBSERVATION, states) - log_density
     weights += LINEAR.log_transition(states, PREVIOUS)
     H, Q, R = (np.asarray(part, float) for part in (LINEAR.H, LINEAR.Q, LINEAR.R))
@@ -65,7 +66,7 @@ def test_on_a_linear_model_the_weight_is_the_normaliser_whatever_is_drawn():
     predicted = np.asarray(LINEAR.observation_mean(LINEAR.transition_mean(PREVIOUS)), float)
     expected = predictive.logpdf(np.asarray(OBSERVATION, float) - predicted)
     inflated = GaussNewtonProposal(inflation=1.7)
-    for found in (weights, inflated.log_normaliser(OBSERVATION, PREVIOUS)):
+    for found in (weights, inflated.log_normaliser(NOW, PREVIOUS)):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 
 
@@ -74,8 +75,8 @@ def test_on_the_quadratic_model_it_finds_the_mode_of_each_particles_own_side():
     with float64():
         model = mpfjax.QuadraticModel(0.5, 0.1)
         proposal = GaussNewtonProposal(num_iterations=8, inflation=0.01)
-        key, seen = jax.random.key(5), jnp.array(1.0)
-        states, log_density = propose(proposal, key, seen, jnp.array(previous))
+        key, now = jax.random.key(5), mpfjax.Step(model, jnp.array(1.0))
+        states, log_density = propose(proposal, key, now, jnp.array(previous))
         assert states.dtype == log_density.dtype == np.float64
     np.testing.assert_allclose(states, ends, atol=0.05)
 

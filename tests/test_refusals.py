@@ -83,12 +83,11 @@ MANY = {"keys": KEY[None], "observations": TWO}
 GUIDE = mpfjax.GaussNewtonProposal()
 # The arguments of a good call that have no default, or whose default leaves something out.
 GOOD = {
-    **alike({}, mpfjax.QuadraticModel, KMeans, mpfjax.Split, mpfjax.Prune, IslandInteraction),
-    **alike({"model": MODEL}, Propagate, Predict, Reweight, mpfjax.GaussNewtonProposal,
-            mpfjax.RandomWalkMetropolis, mpfjax.MetropolisAdjustedLangevin),
-    **alike({"model": SWITCHING}, mpfjax.RegimeProposal, mpfjax.PropagateMarginalised,
-            mpfjax.PropagateRegimes),
-    **alike({"model": JOINT}, mpfjax.Partitioned, PropagateIndependently, PropagateInClusters),
+    **alike({}, mpfjax.QuadraticModel, KMeans, mpfjax.Split, mpfjax.Prune, IslandInteraction,
+            Propagate, Predict, Reweight, mpfjax.GaussNewtonProposal, mpfjax.RandomWalkMetropolis,
+            mpfjax.MetropolisAdjustedLangevin, mpfjax.RegimeProposal, mpfjax.PropagateMarginalised,
+            mpfjax.PropagateRegimes, mpfjax.Partitioned, PropagateIndependently,
+            PropagateInClusters),
     **alike({"particles_per_component": 2}, Resample, mpfjax.GaussianRegeneration),
     **alike({"filter": FILTER}, mpfjax.with_lookahead, mpfjax.with_point_sets,
             mpfjax.with_score_gradient),
@@ -120,8 +119,8 @@ GOOD = {
     mpfjax.GroupBy: {"function": nothing},
     mpfjax.Every: {"num_steps": 2, "moves": [KMeans(1)]},
     mpfjax.PropagateNested: {"propagate": Propagate(), "num_draws": 2},
-    mpfjax.PropagateTempered: {"model": MODEL, "resample": Resample(), "exponents": (0.1, 1.0)},
-    SelectInitial: {"propagation": Propagate(), "num_draws": 2},
+    mpfjax.PropagateTempered: {"resample": Resample(), "exponents": (0.1, 1.0)},
+    SelectInitial: {"num_draws": 2},
     Filter: {"model": MODEL, "moves": [Propagate()], "num_particles": 4},
     mpfjax.with_resampling: {"filter": FILTER, "resample": Resample()},
     mpfjax.auxiliary_particle_filter: {"model": MODEL, "num_particles": 4, "lookahead": GUIDE},
@@ -217,7 +216,7 @@ def test_every_public_call_is_tried():
     others = {name for name in public - tried if not name.startswith(("_", "Abstract"))}
     # Records of results, what takes no argument to check, and what other tests are about.
     assert others == {
-        "FilterRun", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "Pool",
+        "FilterRun", "Step", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
         "NetworkProposal", "keep_programs", "check_model", "simulate", "map_moves",
     }  # fmt: skip
@@ -428,11 +427,21 @@ REFUSED = (
      lambda: mpfjax.Study(**GOOD[mpfjax.Study] | {"settings": {"filter": [1]}})),
     # propagation, several objects, look-ahead
     ("Batched defines no log_transition, which gradient=",
-     lambda: Propagate(gradient="stop")),
-    ("Batched defines no transition_from_noise", lambda: Propagate(noise="rqmc")),
-    ("noise_dimension", lambda: Propagate(noise="rqmc")),
+     lambda: Filter(Batched(), [Propagate(gradient="stop")], 4)),
+    ("Batched defines no transition_from_noise",
+     lambda: Filter(Batched(), [Propagate(noise="rqmc")], 4)),
+    ("noise_dimension",
+     lambda: Filter(changed(Drift, noise_dimension=65), [Propagate(noise="rqmc")], 4)),
     ("inherits its transition_from_noise, which noise='rqmc' needs",
-     lambda: Propagate(noise="rqmc")),
+     lambda: Filter(changed(Drift, sample_transition=lambda self, key, x: x),
+                    [Propagate(noise="rqmc")], 4)),
+    *(
+        (f"{kind.__name__} holds no model; the filter gives it its own",
+         lambda kind=kind: kind(MODEL))
+        for kind in (Propagate, Reweight, mpfjax.PropagateMarginalised, mpfjax.PropagateTempered,
+                     mpfjax.RandomWalkMetropolis, mpfjax.Partitioned, mpfjax.GaussNewtonProposal,
+                     SelectInitial)
+    ),
     ("sort_by: 9 coordinates", lambda: run_of(
         changed(Drift, sample_initial=lambda self, key, n: jnp.zeros((n, 9))), noise="rqmc")),
     ("propagate: gradient 'stop'",
@@ -443,7 +452,7 @@ REFUSED = (
      lambda: run(Filter(MODEL, [mpfjax.RandomWalkMetropolis(), Propagate()], 4))),
     ("IslandInteraction leaves no particle one parent", lambda: Filter(MODEL, [Propagate(),
         mpfjax.Every(2, [IslandInteraction()]), mpfjax.RandomWalkMetropolis()], 4)),
-    ("model: .* is conditionally linear", lambda: Reweight(0.5)),
+    ("model: .* is conditionally linear", lambda: Filter(SWITCHING, [Predict(), Reweight(0.5)], 4)),
     ("object_model: .* is conditionally linear",
      lambda: mpfjax.ClutteredModel(SWITCHING, 0.9, 0.1)),
     ("orders: ", lambda: mpfjax.partitioned_sampling(JOINT, 10, (0, 0))),

@@ -139,10 +139,11 @@ def test_standardised_coordinates_make_units_immaterial():
 
 def test_components_of_one_particle_and_all_particles_at_one_point():
     propagate = eqx.filter_jit(Propagate(noise="rqmc"))
+    now = mpfjax.Step(Drift(), jnp.array(0.5))
     labels = np.array([0, 1, 2, 3, 4, 4, 4, 4, 4, 4])
     for states in (np.ones((10, 2)), np.arange(20.0).reshape(10, 2)):
         mixture = make_mixture(states, np.zeros(10), labels, 5)
-        moved = propagate(KEY, resampled(mixture, "hilbert"), jnp.array(0.5))
+        moved = propagate(KEY, resampled(mixture, "hilbert"), now)
         assert np.isfinite(moved.particles).all()
         assert len(np.unique(moved.particles[:, 0])) == 10
 

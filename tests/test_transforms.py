@@ -65,7 +65,7 @@ def test_they_compose_on_a_chain_of_ones_own():
     assert (propagate.noise, propagate.gradient, filter.initial_noise) == ("rqmc", "stop", "rqmc")
     select = filter.initial_moves[0]
     assert isinstance(select, SelectInitial)
-    assert (select.noise, select.propagation.noise) == ("rqmc", "rqmc")
+    assert select.noise == "rqmc"
     assert np.isfinite(mpfjax.run_filter(KEY, filter, OBSERVATIONS).log_marginal_likelihood)
 
 
@@ -103,6 +103,6 @@ def test_a_filter_is_replaced_by_its_own_arguments():
     filter = with_selected_start(own_chain(), 3)
     changed = filter.replace(model=other, num_particles=50)
     assert changed.num_particles == 50
-    for held in (changed.model, changed.moves[1].model, changed.initial_moves[0].propagation.model):
-        assert held is other
+    assert changed.model is other
     assert changed.initial_moves[0].num_draws == 3
+    assert not any(isinstance(held, type(other)) for held in vars(changed.moves[1]).values())

@@ -1,5 +1,7 @@
 """Independent and adaptive partitions, proposals of one joint filter that are close to clusters."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,25 +27,27 @@ class ProposeInPartitions(mpfjax.AbstractPropagation):
     - `num_draws`: K; None takes every object to be far from all others.
     """
 
-    model: mpfjax.MultiObjectModel
     num_draws: int | None = eqx.field(static=True, default=1)
 
     approximate = True  # objects far apart need not be independent
 
     def __call__(
-        self, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, observation: PyTree
+        self, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, now: mpfjax.Step
     ) -> mpfjax.ParticleMixture:
         """Propagate every object, and weigh the rows by what they see and by ψ."""
+        model: Any = now.model
+        if now.observation is None:
+            return mixture.replace(particles=model.sample_transition(key, mixture.particles))
         num_draws = self.num_draws or 1
-        keys = jax.random.split(key, 3 * self.model.num_objects).reshape(3, -1)
-        objects = jnp.arange(self.model.num_objects, dtype=jnp.int32)
-        seen = self.model.prepare_observation(observation)
+        keys = jax.random.split(key, 3 * model.num_objects).reshape(3, -1)
+        objects = jnp.arange(model.num_objects, dtype=jnp.int32)
+        seen = model.prepare_observation(now.observation)
         # The K points of a row stand side by side.
         repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_draws, axis=0), mixture.particles)
 
         def draw(key: Key[Array, ""], states: PyTree, j: Int[Array, ""]) -> tuple:
-            points = self.model.sample_object_transition(key, states, j)
-            log_likelihoods = self.model.object_log_likelihood(seen, points, j)
+            points = model.sample_object_transition(key, states, j)
+            log_likelihoods = model.object_log_likelihood(seen, points, j)
             return points, log_likelihoods.reshape(-1, num_draws)
 
         points, tables = jax.vmap(draw, in_axes=(0, 1, 0), out_axes=(1, 0))(
@@ -51,7 +55,7 @@ class ProposeInPartitions(mpfjax.AbstractPropagation):
         )
         near = jnp.zeros(len(objects), bool)
         if self.num_draws is not None:
-            near = self._near(jax.tree.map(lambda leaf: leaf[::num_draws], points))
+            near = _near(model, jax.tree.map(lambda leaf: leaf[::num_draws], points))
         from_any = jax.vmap(_from_any_row)(keys[1], tables)
         from_own = jax.vmap(_from_own_row)(keys[2], tables)
         places, log_factors = (
@@ -61,35 +65,31 @@ class ProposeInPartitions(mpfjax.AbstractPropagation):
         gather = jax.vmap(lambda leaf, rows: leaf[rows], in_axes=(1, 0), out_axes=1)
         particles = jax.tree.map(lambda leaf: gather(leaf, places), points)
         log_factors = jnp.sum(log_factors, axis=0)
-        for i, j in self._pairs():
+        for i, j in _pairs(model):
             states = _states_of(particles, i, j)
-            log_factors += self.model.interaction(*states)  # pyright: ignore
+            log_factors += model.interaction(*states)
         return mixture.replace(particles=particles).weighed(log_factors)
 
-    def predict(
-        self, key: Key[Array, ""], mixture: mpfjax.ParticleMixture
-    ) -> mpfjax.ParticleMixture:
-        """Draw x_t ~ D(. | x_{t-1}) of all objects."""
-        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
 
-    def _pairs(self) -> list[tuple[int, int]]:
-        """The pairs of objects that may interact."""
-        num_objects = self.model.num_objects if self.model.interaction is not None else 0
-        return [(i, j) for j in range(num_objects) for i in range(j)]
+def _pairs(model: mpfjax.MultiObjectModel) -> list[tuple[int, int]]:
+    """The pairs of objects that may interact."""
+    num_objects = model.num_objects if model.interaction is not None else 0
+    return [(i, j) for j in range(num_objects) for i in range(j)]
 
-    def _near(self, points: PyTree) -> Bool[Array, " objects"]:
-        """Which objects have a point that interacts with any point of another object."""
-        near = jnp.zeros(self.model.num_objects, bool)
-        for i, j in self._pairs():
-            states, others = _states_of(points, i, j)
 
-            def meets(state: PyTree, others: PyTree = others) -> Bool[Array, ""]:
-                repeat = lambda own, other: jnp.broadcast_to(own[None], other.shape)  # noqa: E731
-                states = jax.tree.map(repeat, state, others)
-                return jnp.any(self.model.interaction(states, others) != 0)  # pyright: ignore
+def _near(model: mpfjax.MultiObjectModel, points: PyTree) -> Bool[Array, " objects"]:
+    """Which objects have a point that interacts with any point of another object."""
+    near = jnp.zeros(model.num_objects, bool)
+    for i, j in _pairs(model):
+        states, others = _states_of(points, i, j)
 
-            near = near.at[jnp.array([i, j])].max(jnp.any(jax.vmap(meets)(states)))
-        return near
+        def meets(state: PyTree, others: PyTree = others) -> Bool[Array, ""]:
+            repeat = lambda own, other: jnp.broadcast_to(own[None], other.shape)  # noqa: E731
+            states = jax.tree.map(repeat, state, others)
+            return jnp.any(model.interaction(states, others) != 0)  # pyright: ignore
+
+        near = near.at[jnp.array([i, j])].max(jnp.any(jax.vmap(meets)(states)))
+    return near
 
 
 def _states_of(particles: PyTree, *objects: int) -> list[PyTree]:
@@ -124,5 +124,5 @@ def adaptive_partitions(
 
     Without `num_draws` every object is drawn on its own: independent partitions.
     """
-    moves = [mpfjax.Resample(), ProposeInPartitions(model, num_draws)]
+    moves = [mpfjax.Resample(), ProposeInPartitions(num_draws)]
     return mpfjax.Filter(model, moves=moves, num_particles=num_particles)

@@ -2,7 +2,6 @@
 
 import importlib.util
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -16,7 +15,7 @@ from benchmarks.peers.libraries import blackjax_steps
 PEER = "blackjax, bootstrap filter"
 
 
-class AdaptiveMonteCarlo(mpfjax.AbstractMove):
+class AdaptiveMonteCarlo(mpfjax.AbstractPropagation):
     """A step of AMCL (Fox 2003; Thrun, Burgard and Fox 2005, table 8.3) as ROS has it.
 
     Particles are drawn one by one, until the bound on the Kullback-Leibler divergence holds for the
@@ -24,23 +23,21 @@ class AdaptiveMonteCarlo(mpfjax.AbstractMove):
     from running averages of the likelihood. The settings are those that its documentation advises.
     """
 
-    model: Any
-
     approximate = True
-    propagates = True
-    resamples = True
     keeps_parents = False
     least, error, z = 2000, 0.05, 0.99  # the most is the filter's N
     slow, fast = 0.001, 0.1
     bins = (0.5, 0.5, np.pi / 18)
 
-    def initial_memory(self, num_components: int) -> dict[str, Any]:
+    def initial_memory(
+        self, model: mpfjax.AbstractStateSpaceModel, num_components: int
+    ) -> dict[str, Any]:
         """The logarithms of w_slow and w_fast."""
-        del num_components
+        del model, num_components
         return {"averages": jnp.full(2, -jnp.inf)}
 
     def __call__(
-        self, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, observation: Any
+        self, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, now: mpfjax.Step
     ) -> mpfjax.ParticleMixture:
         """Draw, move, and weigh."""
         keys, most = jax.random.split(key, 5), mixture.num_particles
@@ -50,18 +47,18 @@ class AdaptiveMonteCarlo(mpfjax.AbstractMove):
         points = upto[-1] * jax.random.uniform(keys[0], (most,))
         chosen = mixture.particles[jnp.clip(jnp.searchsorted(upto, points), 0, most - 1)]
         is_new = jax.random.uniform(keys[1], (most, 1)) < anew
-        drawn = jnp.where(is_new, self.model.sample_initial(keys[2], most), chosen)
+        drawn = jnp.where(is_new, now.model.sample_initial(keys[2], most), chosen)
         number = self.number(drawn)
-        moved = self.model.sample_transition(keys[3], drawn)
-        logs = self.model.log_likelihood(observation, moved) - jnp.log(number)
+        moved = now.model.sample_transition(keys[3], drawn)
+        logs = now.model.log_likelihood(now.observation, moved) - jnp.log(number)
         logs = jnp.where(jnp.arange(most) < number, logs, -jnp.inf)
-        now = jax.nn.logsumexp(logs)
+        latest = jax.nn.logsumexp(logs)
         # A step with new draws forgets both averages.
         averages = [
             jnp.where(
                 (before > -jnp.inf) & (anew == 0),
-                jnp.logaddexp(jnp.log1p(-rate) + before, jnp.log(rate) + now),
-                now,
+                jnp.logaddexp(jnp.log1p(-rate) + before, jnp.log(rate) + latest),
+                latest,
             )
             for before, rate in ((slow, self.slow), (fast, self.fast))
         ]
@@ -87,12 +84,12 @@ class AdaptiveMonteCarlo(mpfjax.AbstractMove):
 
 
 def replace_some(
-    model: Any, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, _observation: Any
+    key: Key[Array, ""], mixture: mpfjax.ParticleMixture, now: mpfjax.Step
 ) -> mpfjax.ParticleMixture:
     """One in a hundred particles is drawn from x_0's law."""
     keys, size = jax.random.split(key), mixture.num_particles
     is_new = jax.random.uniform(keys[0], (size, 1)) < 0.01
-    drawn = model.sample_initial(keys[1], size)
+    drawn = now.model.sample_initial(keys[1], size)
     return mixture.replace(particles=jnp.where(is_new, drawn, mixture.particles))
 
 
@@ -111,9 +108,9 @@ def mixture(model: Any, num_particles: int, max_components: int) -> mpfjax.Filte
 FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
     "particle filter": lambda model, n, m: mpfjax.particle_filter(model, n, ess_threshold=0.5),
     "replacing 1%": lambda model, n, m: mpfjax.Filter(
-        model, [mpfjax.Resample(), partial(replace_some, model), mpfjax.Propagate()], n
+        model, [mpfjax.Resample(), replace_some, mpfjax.Propagate()], n
     ),
-    "AMCL": lambda model, n, m: mpfjax.Filter(model, [AdaptiveMonteCarlo(model)], 5000),
+    "AMCL": lambda model, n, m: mpfjax.Filter(model, [AdaptiveMonteCarlo()], 5000),
     "mixture": mixture,
     "mixture, with_restarts": lambda model, n, m: mpfjax.with_restarts(mixture(model, n, m), 1e-3),
 }

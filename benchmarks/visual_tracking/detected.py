@@ -66,10 +66,10 @@ class Seats(AbstractMove):
     keeps_mass = True
 
     def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: Any
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: mpfjax.Step
     ) -> ParticleMixture:
         """Deal the particles out."""
-        del key, observation
+        del key, now
         seats = jnp.arange(mixture.num_particles, dtype=jnp.int32) // PARTICLES
         return mixture.replace(component_indicators=seats)
 
@@ -86,8 +86,11 @@ class Decide(AbstractMove):
     weighs = False
     keeps_mass = True
 
-    def initial_memory(self, num_components: int) -> dict[str, Any]:
+    def initial_memory(
+        self, model: mpfjax.AbstractStateSpaceModel, num_components: int
+    ) -> dict[str, Any]:
         """Nobody, and no detection."""
+        del model
         m, none = num_components, jnp.zeros(num_components, jnp.int32)
         never = jnp.zeros(m, bool)
         boxes, full, unsure = jnp.zeros((m, 4)), jnp.zeros((), bool), jnp.zeros(m)
@@ -95,12 +98,13 @@ class Decide(AbstractMove):
         return {DECIDED: Decided(self.start, tracks, never)}
 
     def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: Seen
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: mpfjax.Step
     ) -> ParticleMixture:
         """Remember what is decided."""
+        seen: Seen = now.observation
         before = mixture.memory[DECIDED].tracker
         state = before._replace(objects=moments(mixture))
-        state, tracks = advanced(self.tracker, state, observation.detections, observation.colours)
+        state, tracks = advanced(self.tracker, state, seen.detections, seen.colours)
         born = (tracks.identities > 0) & (tracks.identities != before.lives.identities)
         decided = {DECIDED: Decided(state, tracks, born)}
         return mixture.replace(memory=mixture.memory | decided)
@@ -127,10 +131,10 @@ class FollowDetections(AbstractPropagation):
     keeps_parents = False
 
     def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: Seen
+        self, key: Key[Array, ""], mixture: ParticleMixture, now: mpfjax.Step
     ) -> ParticleMixture:
         """Follow the detections, and begin components."""
-        decided, found = mixture.memory[DECIDED], observation.detections
+        decided, found = mixture.memory[DECIDED], now.observation.detections
         noises, owner = decided.tracker.noise.noises, mixture.component_indicators
         assert found.rows is not None  # `from_boxes` says them
         mine = found.rows[None] == decided.tracks.detections[:, None]

@@ -18,7 +18,7 @@ def ahead(model, observation, states, weights):
 
     @eqx.filter_jit
     def look(model, observation, mixture):
-        return PilotLookahead().at_step_of(mixture)(observation, mixture.particles)
+        return PilotLookahead().log_factors(mixture, mpfjax.Step(model, observation))
 
     return np.exp(np.asarray(look(model, observation, mixture), float))
 

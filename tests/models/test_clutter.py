@@ -43,12 +43,12 @@ def by_associations(sets, p_d=P_D, clutter=CLUTTER):
 class Wide(mpfjax.AbstractProposal):
     """A guided proposal that does without a single measurement: twice the variance."""
 
-    def propose(self, key, observation, previous_states):
+    def propose(self, key, now, previous_states):
         noise = jax.random.normal(key, previous_states.shape)
         drawn = A * previous_states + np.float32(np.sqrt(2 * Q)) * noise
-        return drawn, self.log_density(observation, drawn, previous_states)
+        return drawn, self.log_density(now, drawn, previous_states)
 
-    def log_density(self, observation, states, previous_states):
+    def log_density(self, now, states, previous_states):
         gaps = states - A * previous_states
         return jnp.sum(jax.scipy.stats.norm.logpdf(gaps, scale=np.sqrt(2 * Q)), axis=1)
 
@@ -144,7 +144,7 @@ def test_chances_and_densities_may_be_functions_and_measurements_trees_of_one_pa
 
 def test_what_needs_a_single_measurement_is_refused():
     for missing, make in (
-        ("observation_mean", lambda: guided(mpfjax.GaussNewtonProposal())),
+        ("observation_mean", lambda: mpfjax.particle_filter(MODEL, 4, proposal=mpfjax.GaussNewtonProposal())),
         ("sample_observation", lambda: mpfjax.simulate(KEY, MODEL, 2)),
     ):
         with pytest.raises(ValueError, match=f"ClutteredModel.* {missing}"):

@@ -25,7 +25,7 @@ SQUARE = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
 def test_laplaces_approximation_is_close_where_the_state_is_well_known():
     model = mpfjax.QuadraticModel(0.1, 0.2, -2.0, 2.0)
     states = jnp.array([0.8, 1.0, 1.3, -1.1])
-    found = GaussNewtonProposal().log_normaliser(jnp.float32(1.1), states)
+    found = GaussNewtonProposal().log_normaliser(mpfjax.Step(model, jnp.float32(1.1)), states)
     grid = np.linspace(-3, 3, 6001)
     for value, state in zip(found, np.asarray(states, float), strict=True):
         likelihood = np.exp(-0.5 * ((1.1 - grid**2) / 0.2) ** 2) / 0.2
@@ -52,7 +52,7 @@ MIXTURE = make_mixture(RNG.normal(size=30), RNG.normal(size=30), np.arange(30) %
 
 @eqx.filter_jit
 def moved_by(look, observation):
-    return AuxiliaryResample(Resample(), look)(KEY, MIXTURE, observation)
+    return AuxiliaryResample(Resample(), look)(KEY, MIXTURE, mpfjax.Step(SQUARE, observation))
 
 
 @pytest.mark.exactness
@@ -65,11 +65,11 @@ def test_what_is_expected_stays_the_same_in_every_component():
         values = jnp.stack([jnp.ones(30), mixture.particles, mixture.particles**2], axis=1)
         return mixture.component_sums(scaled[:, None] * values)
 
-    y = jnp.float32(1.5)
-    one = jax.jit(jax.vmap(lambda key: sums(move(key, MIXTURE, y))))
+    now = mpfjax.Step(SQUARE, jnp.float32(1.5))
+    one = jax.jit(jax.vmap(lambda key: sums(move(key, MIXTURE, now))))
     moved = np.asarray(one(jax.random.split(KEY, 4000)))
     assert_unbiased(moved, sums(MIXTURE), errors=4.5, slack=1e-5)
-    due = np.asarray(move.would_resample(MIXTURE, y))
+    due = np.asarray(move.would_resample(MIXTURE, now))
     assert due.any()
     assert not due.all()
     assert (moved.std(0)[:, 0] > 1e-3)[due].all()  # the mass does vary

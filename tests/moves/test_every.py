@@ -55,7 +55,7 @@ def test_a_label_that_dies_within_and_is_used_again_has_no_past():
     )
     every = Every(1, [Merge(None, 1.0, patience=2), Split(1.0)])
     durations = jnp.array([[5, 5, 0], [5, 5, 0], [0, 0, 5]], jnp.int32)
-    memory = every.initial_memory(3) | {"overlap_durations": durations}
+    memory = every.initial_memory(MODEL, 3) | {"overlap_durations": durations}
     after = every(KEYS[0], mixture.replace(memory=memory))
     np.testing.assert_array_equal(np.unique(after.component_indicators), [0, 1, 2])
     assert after.memory["overlap_durations"][0, 1] == 0

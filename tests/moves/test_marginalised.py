@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax import Filter, GroupBy, KMeans, PropagateRegimes, RegimeProposal, Resample
+from mpfjax import Filter, GroupBy, KMeans, PropagateRegimes, RegimeProposal, Resample, Step
 from mpfjax.exact import kalman_filter, switching_filter
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.moves.propagation.regimes import children
@@ -250,8 +250,8 @@ def test_no_child_is_kept_twice_and_every_component_keeps_its_mass(name):
     start, move = final_of(name), FILTERS[name]().moves[0]
     keys = jax.random.split(KEY, 400)
     start = start.replace(ancestor_indices=jnp.arange(NUM_PARTICLES, dtype=jnp.int32))
-    seen = jax.jit(jax.vmap(lambda key: move(key, start, OBSERVATIONS[3])))(keys)
-    unseen = jax.jit(jax.vmap(lambda key: move.predict(key, start)))(keys)
+    seen = jax.jit(jax.vmap(lambda key: move(key, start, Step(MODEL, OBSERVATIONS[3]))))(keys)
+    unseen = jax.jit(jax.vmap(lambda key: move(key, start, Step(MODEL))))(keys)
     for after in jax.tree.map(np.asarray, (seen, unseen)):
         child = after.ancestor_indices * NUM_REGIMES + after.particles.latent
         filled = after.log_weights > -np.inf

@@ -19,10 +19,10 @@ class Watch(AbstractMarkovMove):
 
     needs_parents = True
 
-    def __call__(self, key, mixture, observation=None):
+    def __call__(self, key, mixture, now):
         return mixture.replace(memory=mixture.memory | {"parents": mixture.parents})
 
-    def initial_memory(self, num_components):
+    def initial_memory(self, model, num_components):
         return {"parents": jnp.zeros((64, 2))}
 
 

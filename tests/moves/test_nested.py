@@ -39,6 +39,7 @@ LABELS = np.array([0, 0, 1, 1, 1, 2])
 def test_weights_are_means_and_draws_are_kept_by_theirs(noise):
     """E[weight of those that keep a value] is its likelihood, for every value, one of them zero."""
     move = PropagateNested(Propagate(noise=noise), 5)
+    now = mpfjax.Step(Marked(LIKELIHOODS), jnp.float32(0))
     mixture = make_mixture(np.zeros((6, 2)), np.arange(6.0) / 5, LABELS, 3)
     places = jnp.stack([jnp.zeros(6, jnp.int32), jnp.arange(6, dtype=jnp.int32)], axis=1)
     mixture = mixture.replace(particles=places)
@@ -46,7 +47,7 @@ def test_weights_are_means_and_draws_are_kept_by_theirs(noise):
     @jax.jit
     @jax.vmap
     def masses(key):
-        moved = move(key, mixture, jnp.float32(0))
+        moved = move(key, mixture, now)
         weights = jnp.exp(moved.log_weights + moved.log_scale)
         kept = jax.nn.one_hot(moved.particles[:, 0], 4)
         return weights[:, None] * kept, moved.particles[:, 1]
@@ -64,8 +65,8 @@ def test_an_empty_slot_and_a_hopeless_family_stay_without_weight():
 
     @eqx.filter_jit
     def moved(likelihoods):
-        move = PropagateNested(Propagate(), 3)
-        return move(jax.random.key(0), mixture, jnp.float32(0)).log_weights
+        now = mpfjax.Step(Marked(likelihoods), jnp.float32(0))
+        return PropagateNested(Propagate(), 3)(jax.random.key(0), mixture, now).log_weights
 
     assert (np.asarray(moved(0 * LIKELIHOODS)) == -np.inf).all()
     assert (np.asarray(moved(1 + LIKELIHOODS)) > -np.inf).tolist() == [True, False, True, True]

@@ -29,8 +29,8 @@ NUM_RUNS = 600
 
 
 @eqx.filter_jit
-def apply(move, mixture, observation):
-    return move(KEY, mixture, observation)
+def apply(move, mixture, model, observation):
+    return move(KEY, mixture, mpfjax.Step(model, observation))
 
 
 def normal(x, variance):
@@ -98,7 +98,9 @@ def test_without_resampling_weights_are_those_of_the_joint_state(orders):
     labels = rng.integers(0, 2, 40)
     mixture = make_mixture(rng.normal(size=(40, 3, 1)), log_weights, labels, 2)
     between = Resample(ess_threshold=0.0, allocation="equal")
-    moved = apply(Partitioned(orders, resample=between), mixture, OBSERVATIONS[0])
+    moved = apply(
+        Partitioned(orders, resample=between), mixture, REPELLING, OBSERVATIONS[0]
+    )
     before = mixture.log_weights[moved.ancestor_indices]
     expected = before + REPELLING.log_likelihood(OBSERVATIONS[0], moved.particles)
     filled = np.asarray(moved.occupied)
@@ -114,7 +116,7 @@ def test_the_object_moved_last_keeps_every_hypothesis():
     mixture = make_mixture(np.zeros((90, 3, 1)), np.zeros(90), np.repeat(np.arange(3), 30), 3)
 
     def moved_last(orders):
-        moved = apply(Partitioned(orders), mixture, OBSERVATIONS[0])
+        moved = apply(Partitioned(orders), mixture, APART, OBSERVATIONS[0])
         particles, labels = np.asarray(moved.particles), np.asarray(moved.component_indicators)
         distinct = [[len(np.unique(particles[labels == c, j])) for j in range(3)] for c in range(3)]
         return [np.flatnonzero(np.array(row) == 30).tolist() for row in distinct]
@@ -126,7 +128,7 @@ def test_the_object_moved_last_keeps_every_hypothesis():
 
 def test_random_orders_are_all_drawn():
     move = Partitioned("random")
-    orders = jax.vmap(lambda key: move._orders(key, 2))(jax.random.split(KEY, 3000))
+    orders = jax.vmap(lambda key: move._orders(key, 3, 2))(jax.random.split(KEY, 3000))
     kinds, counts = np.unique(np.asarray(orders).reshape(-1, 3), axis=0, return_counts=True)
     assert len(kinds) == 6
     assert np.abs(counts - 1000).max() < 4 * np.sqrt(6000 / 6 * 5 / 6)
@@ -141,12 +143,12 @@ class HalfBlind(mpfjax.QuadraticModel):
 
 @cache
 def of_three_places(reassembly):
-    """A move, and three components of ten particles at places of their own."""
+    """A move, three components of ten particles at places of their own, and their model."""
     model = MultiObjectModel(HalfBlind(0.1, 0.1, -1.0, 1.0), 2, shared_observation=True)
     labels = np.repeat(np.arange(3), 10)
     states = np.array([5.0, -5.0, 4.0])[labels][:, None] * np.ones((1, 2))
     mixture = make_mixture(states, 0.1 * np.arange(30), labels, 3)
-    return Partitioned("circular", reassembly=reassembly), mixture
+    return Partitioned("circular", reassembly=reassembly), mixture, model
 
 
 @pytest.mark.exactness
@@ -154,12 +156,12 @@ def of_three_places(reassembly):
 def test_what_dies_leaves_its_slots_and_where_all_is_lost_particles_follow_their_dynamics(
     reassembly,
 ):
-    move, before = of_three_places(reassembly)
-    after = apply(move, before, jnp.array(0.0))
+    move, before, model = of_three_places(reassembly)
+    after = apply(move, before, model, jnp.array(0.0))
     assert after.active.tolist() == [True, False, True]
     assert after.component_counts.tolist() == [15, 0, 15]
     assert (np.asarray(after.particles) > 3).all()
-    lost = apply(move, before, jnp.array(50.0))
+    lost = apply(move, before, model, jnp.array(50.0))
     assert float(lost.log_mass) == -np.inf
     np.testing.assert_array_equal(lost.component_indicators, before.component_indicators)
     np.testing.assert_allclose(lost.particles, before.particles, atol=0.6)

@@ -113,11 +113,11 @@ class TestMerge:
     def test_patience_counts_steps_in_a_row(self):
         near, far = clouds([[0.0], [0.1]], [30, 30]), clouds([[0.0], [50.0]], [30, 30])
         merge = Merge(2.0, patience=3)
-        memory = merge.initial_memory(6)
+        memory = merge.initial_memory(None, 6)
         merged = []
         for mixture in (near, near, far, near, near, near, near):
             moved = eqx.filter_jit(merge)(KEY, mixture.replace(memory=memory))
-            memory = merge.forget(moved.memory, ~moved.active)
+            memory = moved.memory
             merged.append(int(moved.component_indicators[-1]) == 0)
         # After a merge both labels start a count of their own.
         assert merged == [False, False, False, False, False, True, False]
@@ -260,7 +260,7 @@ def test_only_what_is_below_the_share_of_the_heaviest_is_pruned(masses):
     kept = lives[np.asarray(before.component_indicators)]
     np.testing.assert_array_equal(after.log_weights[kept], before.log_weights[kept])
     assert Prune().approximate
-    assert Prune(1e-3).predict(KEY, before) is before
+    assert Prune(1e-3)(KEY, before, mpfjax.Step(MODEL)) is before
 
 
 class FourAlike(mpfjax.AbstractStateSpaceModel):

@@ -8,7 +8,7 @@ import pytest
 import scipy.stats
 
 import mpfjax
-from mpfjax.moves.restarts import SURPRISE
+from mpfjax.moves.alarm import is_alarmed
 from tests.marking import quick_of
 from tests.user_models import ScalarLinear
 
@@ -97,7 +97,7 @@ def test_an_alarm_is_given_where_all_hypotheses_are_wrong(name, told):
 def test_after_a_restart_the_state_is_found_and_the_alarm_ends(told):
     run, _ = told["restarts", True]
     np.testing.assert_allclose(jax.vmap(lambda m: m.mean())(run.final), 11.0, atol=0.5)
-    assert not np.asarray(run.final.memory[SURPRISE] > 5).any()
+    assert not np.asarray(is_alarmed(run.final)).any()
 
 
 def test_the_evidence_is_that_of_the_prior_beside_the_increment(told):
@@ -107,29 +107,13 @@ def test_the_evidence_is_that_of_the_prior_beside_the_increment(told):
     np.testing.assert_allclose(found, -np.log(40), atol=0.4)
 
 
-class Watching(mpfjax.AbstractMove):
-    """Keeps what the step's increment is."""
-
-    keeps_mass = True
-    weighs = False
-    reads = frozenset({"log_increment"})
-
-    def initial_memory(self, num_components):
-        return {"seen": jax.numpy.zeros(())}
-
-    def __call__(self, key, mixture, observation):
-        return mixture.replace(memory=mixture.memory | {"seen": mixture.memory["log_increment"]})
-
-
-def test_moves_and_collect_see_the_increment_the_time_and_the_inputs():
-    plain = FILTERS["particle filter"]
-    filter = plain.replace(moves=[*plain.moves, Watching()])
-
+def test_collect_sees_the_time_and_the_inputs():
     def collect(mixture, t, inputs):
-        return mixture.memory["seen"], t, inputs
+        return t, inputs
 
-    run = mpfjax.run_filter(jax.random.key(0), filter, OBSERVATIONS[:5], collect)
-    seen, times, inputs = run.collected
-    np.testing.assert_array_equal(seen, run.log_likelihood_increments)
+    filter = FILTERS["particle filter"]
+    times, inputs = mpfjax.run_filter(
+        jax.random.key(0), filter, OBSERVATIONS[:5], collect
+    ).collected
     np.testing.assert_array_equal(times, [1, 2, 3, 4, 5])
     assert inputs is None

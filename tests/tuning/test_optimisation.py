@@ -110,7 +110,7 @@ class TestResuming:
             ({"start": {"r": 0.7}}, r"filter\.model\.r is .* 0\.5 there and .* 0\.7 here"),
             ({"start": {"q": 0.7}}, r"filter\.model\.q is"),
             ({"start": {"num_particles": 8}}, r"filter\.num_particles is 16 there and 8 here"),
-            ({"start": {"gradient": "none"}}, r"filter\._moves\[0\]\.gradient is"),
+            ({"start": {"gradient": "none"}}, r"filter\.moves\[0\]\.gradient is"),
             ({"observations": OBSERVATIONS.at[3].add(1e-6)}, r"observations.* is"),
             ({"key": jax.random.key(1)}, "key is"),
             ({"transforms": {"r": Interval(0.0, 9.0)}}, r"transforms\['r'\]"),

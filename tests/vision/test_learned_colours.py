@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mpfjax import Step
 from mpfjax.mixture import single_component
 from mpfjax.vision import ColourModel, RGBColours
 from mpfjax.vision.boxes.colour_model import BoxState
@@ -66,7 +67,7 @@ def test_the_likelihood_and_what_is_learned_by_hand(anchor, hidden, rate):
     frame = jnp.asarray(NOW)
     np.testing.assert_allclose(model.log_likelihood(frame, states)[0], log_likelihood, atol=1e-4)
     mixture = single_component(states)
-    moved = AdaptAppearance(rate)(jax.random.key(0), mixture, frame)
+    moved = AdaptAppearance(rate)(jax.random.key(0), mixture, Step(model, frame))
     np.testing.assert_allclose(moved.particles.appearance[0, 0], learned, atol=1e-4)
     np.testing.assert_array_equal(moved.log_weights, mixture.log_weights)
     np.testing.assert_array_equal(moved.particles.box, states.box)
