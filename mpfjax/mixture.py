@@ -460,7 +460,7 @@ def _averages(average: Callable[[Array], Array], values: PyTree, periods: PyTree
         angle = angle * jnp.broadcast_to(scale, mean.shape)
         return jnp.where(jnp.broadcast_to(period > 0, mean.shape), angle, mean)
 
-    with saying("in periods, which have the form of one state"):
+    with saying("periods", "in the form of one state"):
         return jax.tree.map(on_circle, values, periods)
 
 

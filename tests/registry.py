@@ -95,9 +95,7 @@ def _mpf(m: int = NUM_COMPONENTS, **options) -> Callable[..., Filter]:
     return lambda model: mpfjax.mixture_particle_filter(model, NUM_PARTICLES, m, **options)
 
 
-def _chain(
-    *before, m: int = NUM_COMPONENTS, then=(), proposal=None
-) -> Callable[..., Filter]:
+def _chain(*before, m: int = NUM_COMPONENTS, then=(), proposal=None) -> Callable[..., Filter]:
     return lambda model: Filter(
         model,
         [*before, Propagate(proposal), *then],

@@ -59,7 +59,7 @@ def scan(
     ) -> tuple[ParticleMixture, PyTree]:
         step_keys, now, t = step
         mixture, info = step_or_predict(filter, step_keys, mixture, now)
-        with saying("in collect, which is called with the mixture after each step"):
+        with saying("collect", "called with the mixture after each step"):
             given: tuple[Any, ...] = (mixture,) if t is None else (mixture, t, now.inputs)
             kept = mixture if collect is None else collect(*given)
         return mixture, (kept, report_of(info))

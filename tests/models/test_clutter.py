@@ -144,7 +144,10 @@ def test_chances_and_densities_may_be_functions_and_measurements_trees_of_one_pa
 
 def test_what_needs_a_single_measurement_is_refused():
     for missing, make in (
-        ("observation_mean", lambda: mpfjax.particle_filter(MODEL, 4, proposal=mpfjax.GaussNewtonProposal())),
+        (
+            "observation_mean",
+            lambda: mpfjax.particle_filter(MODEL, 4, proposal=mpfjax.GaussNewtonProposal()),
+        ),
         ("sample_observation", lambda: mpfjax.simulate(KEY, MODEL, 2)),
     ):
         with pytest.raises(ValueError, match=f"ClutteredModel.* {missing}"):

@@ -98,9 +98,7 @@ def test_without_resampling_weights_are_those_of_the_joint_state(orders):
     labels = rng.integers(0, 2, 40)
     mixture = make_mixture(rng.normal(size=(40, 3, 1)), log_weights, labels, 2)
     between = Resample(ess_threshold=0.0, allocation="equal")
-    moved = apply(
-        Partitioned(orders, resample=between), mixture, REPELLING, OBSERVATIONS[0]
-    )
+    moved = apply(Partitioned(orders, resample=between), mixture, REPELLING, OBSERVATIONS[0])
     before = mixture.log_weights[moved.ancestor_indices]
     expected = before + REPELLING.log_likelihood(OBSERVATIONS[0], moved.particles)
     filled = np.asarray(moved.occupied)

@@ -81,7 +81,7 @@ class AuxiliaryResample(AbstractWrapper):
     def _log_factors(self, mixture: ParticleMixture, now: Step) -> Float[Array, " n"]:
         """log ν of each particle, zero in a component where ν is zero throughout."""
         look: Any = self.lookahead
-        with saying("in lookahead, which is called with an observation and the particles"):
+        with saying("lookahead", "called with an observation and the particles"):
             if hasattr(look, "log_factors"):
                 values = look.log_factors(mixture, now)
             elif hasattr(look, "log_normaliser"):
