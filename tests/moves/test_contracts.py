@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax import Resample
+from mpfjax import QuadraticModel, Resample
 from tests.examples import example_mixtures, log_masses
 from tests.marking import quick_of
 from tests.registry import REGROUPINGS, WITHIN_COMPONENTS
@@ -14,6 +14,7 @@ from tests.registry import REGROUPINGS, WITHIN_COMPONENTS
 # One component has a path of its own, and up to four are worked on as rows.
 MIXTURES = {m: example_mixtures(m) for m in (1, 3, 6)}
 ORDINARY = MIXTURES[6]["ordinary"]
+MODEL = QuadraticModel()
 NUM_DRAWS = 2000
 PLAIN = ("systematic", "stratified", "multinomial", "residual", "ssp")
 CASES = [(name, 3 if name.startswith("s") else 6) for name in WITHIN_COMPONENTS]
@@ -48,7 +49,7 @@ def test_regrouping_changes_nothing_but_indicators_and_memory(name):
     """And leaves a mixture whose summaries are finite."""
     move = REGROUPINGS[name]
     for example, mixture in MIXTURES[6].items():
-        mixture = mixture.replace(memory=move.initial_memory(None, 6))
+        mixture = mixture.replace(memory=move.initial_memory(MODEL, 6))
         moved = moved_by(move, jax.random.key(0), mixture)
         for field in ("particles", "log_weights", "ancestor_indices"):
             np.testing.assert_array_equal(getattr(moved, field), getattr(mixture, field))

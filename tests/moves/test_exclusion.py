@@ -4,8 +4,11 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from mpfjax import QuadraticModel, Step
 from mpfjax.moves.objects.exclusion import Exclusion
 from tests.examples import make_mixture
+
+NOW = Step(QuadraticModel(), np.float32(0.0))
 
 
 def test_each_particle_is_weighed_down_by_the_other_components_means():
@@ -13,7 +16,7 @@ def test_each_particle_is_weighed_down_by_the_other_components_means():
     log_weights = np.array([0.0, 1.0, 0.5, 0.0, -np.inf])
     mixture = make_mixture(states, log_weights, [0, 0, 1, 2, 2], 4)
     move = eqx.filter_jit(Exclusion(3.0, 0.5, scale=2.0))
-    moved = move(jax.random.key(0), mixture, None)
+    moved = move(jax.random.key(0), mixture, NOW)
     means = np.array([0.5, 1.5, 9.0]) / 2
     bumps = np.exp(-((states / 2 - means[None]) ** 2) / (2 * 0.5**2))
     own = np.array([0, 0, 1, 2])
