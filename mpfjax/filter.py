@@ -179,8 +179,8 @@ class Filter(eqx.Module):
         """
         return replaced(self, model=with_inputs(self.model, inputs))
 
-    def _now(self, observation: PyTree) -> Step:
-        return Step(self.model, observation, self.propagation)
+    def _now(self, observation: PyTree, is_initial: bool = False) -> Step:
+        return Step(self.model, observation, self.propagation, is_initial)
 
     def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
         return sample_initial(key, self.model, self.num_particles, self.initial_noise)
@@ -195,7 +195,7 @@ class Filter(eqx.Module):
             particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
         mixture = single_component(particles, self.num_components)
         mixture = mixture.replace(memory=memory_of(self.moves, self.model, self.num_components))
-        now = self._now(observation)
+        now = self._now(observation, is_initial=True)
         for move_key, move in zip(keys, self.initial_moves, strict=True):
             mixture = move(move_key, mixture, now)
         if self.weighs_initially:

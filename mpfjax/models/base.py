@@ -4,7 +4,6 @@ wrapper for models of one particle.
 
 import abc
 import contextlib
-import copy
 import difflib
 import inspect
 from collections.abc import Callable, Iterator
@@ -100,8 +99,8 @@ def with_inputs(model: Any, inputs: PyTree) -> Any:
 
 def replaced(model: Any, /, **fields: Any) -> Any:
     """A copy of a model with some fields set, without checks or conversions."""
-    changed = copy.copy(model)
-    for name, value in fields.items():
+    changed = object.__new__(type(model))
+    for name, value in (vars(model) | fields).items():
         object.__setattr__(changed, name, value)
     return changed
 

@@ -28,6 +28,8 @@ class Step(eqx.Module):
     propagation: "AbstractPropagationOfEach | None" = None
     """how the filter itself draws and weighs x_t of a particle, `(key, mixture, now) -> mixture`;
     None where no move of its chain can."""
+    is_initial: bool = eqx.field(static=True, default=False)
+    """whether it is x_0 that is moved, with y_1 for an observation, if that is known."""
 
 
 class Given(Checked):
@@ -181,8 +183,8 @@ def memory_of(
 
 
 def is_missing(now: Step | None) -> bool:
-    """Whether a move is part of a step without an observation."""
-    return now is not None and now.observation is None
+    """Whether a move is part of a step without an observation, as x_0 is not."""
+    return now is not None and now.observation is None and not now.is_initial
 
 
 Regrouped = tuple[Int[Array, " n"], dict[str, PyTree]]

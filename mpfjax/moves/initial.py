@@ -18,7 +18,7 @@ from mpfjax.models.base import (
 )
 from mpfjax.models.conditionally_linear import is_marginalised, with_moments
 from mpfjax.models.noise import Noise, draw_noise
-from mpfjax.moves.base import AbstractMove, Step, is_missing
+from mpfjax.moves.base import AbstractMove, Step
 from mpfjax.moves.propagation.tempered import accepted
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import HILBERT, Line, sorted_order
@@ -110,7 +110,7 @@ class SelectInitial(AbstractMove):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """The mixture of the chosen x_0, in one component; without y_1 the one given."""
-        if is_missing(now):
+        if now.observation is None:
             return mixture
         n = mixture.num_particles
         start = self._selected(key, now, n, self.num_draws or FEW_DRAWS)

@@ -47,13 +47,13 @@ def test_the_mixtures_alone_give_trajectories_without_x_0():
 def test_rows_that_do_not_fit_together_are_drawn_in_turn(monkeypatch):
     """The same indices whether all densities are held at once or a few."""
     mixture = mpfjax.particle_filter(QUADRATIC, 50).init(jax.random.key(1))
-    futures = jnp.linspace(-2.0, 2.0, 9)
+    futures = jnp.linspace(-2.0, 2.0, 9), jnp.zeros(9, bool)
 
     def drawn():
-        log_density = backward.log_transition_from(QUADRATIC, mixture)
+        log_kernel = backward.log_kernel_from(QUADRATIC, mixture)
 
         def draw(key):
-            return backward.draw_exactly(key, log_density, futures, mixture)
+            return backward.draw_exactly(key, log_kernel, futures, mixture)
 
         return jax.jit(draw)(jax.random.key(2))
 

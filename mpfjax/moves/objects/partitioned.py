@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import check, shown, to_rows
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.moves.base import AbstractPropagation, AbstractWrapper, Step, is_missing
 from mpfjax.moves.propagation.propagate import predict
@@ -183,7 +184,7 @@ def as_orders(orders: Any) -> Any:
     """One order a row, or the name of a rule; a `ValueError` for one that is no permutation."""
     if isinstance(orders, str) and orders not in ("circular", "random"):
         raise ValueError(f"orders: {orders!r} is neither 'circular' nor 'random'")
-    if orders is None or isinstance(orders, str):
+    if orders is None or isinstance(orders, str | AbstractStateSpaceModel):  # refused elsewhere
         return orders
     if isinstance(orders, Tracer):
         return jnp.atleast_2d(orders).astype(jnp.int32)

@@ -109,7 +109,7 @@ class NetworkProposal(_GaussianProposal):
         previous_states: Float[Array, "n ..."],
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """The same, made of this noise."""
-        means, deviations = self._moments(now.observation, previous_states)
+        means, deviations = self._moments(now, previous_states)
         states = means + deviations * noise
         return states.reshape(previous_states.shape), _log_standard(noise, deviations)
 
@@ -120,7 +120,7 @@ class NetworkProposal(_GaussianProposal):
         previous_states: Float[Array, "n ..."],
     ) -> Float[Array, " n"]:
         """log q(x_t | x_{t-1}, y_t) of every particle."""
-        means, deviations = self._moments(now.observation, previous_states)
+        means, deviations = self._moments(now, previous_states)
         return _log_standard((states.reshape(means.shape) - means) / deviations, deviations)
 
     def _moments(

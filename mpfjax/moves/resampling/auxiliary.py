@@ -88,7 +88,7 @@ class AuxiliaryResample(AbstractWrapper):
                 values = look.log_normaliser(now, mixture.particles)
             else:
                 values = look(now.observation, mixture.particles)
-        values = real_each(values, "lookahead: it", mixture.num_particles)
+        values = real_each(values, mixture.num_particles, "lookahead: it")
         log_factors = values.astype(mixture.log_weights.dtype)
         has_any = mixture.weighed(log_factors).active
         counts = spread(has_any, mixture.component_indicators) | ~(log_factors < jnp.inf)
