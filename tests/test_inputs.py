@@ -293,7 +293,7 @@ def test_an_input_of_a_step_that_is_nan_or_not_there_is_an_error():
         FILTER.step(KEY, FILTER.init(KEY), OBSERVATIONS[0], inputs=built_in(u=np.nan))
     with pytest.raises(TypeError) as caught:
         FILTER.step(KEY, FILTER.init(KEY), OBSERVATIONS[0])
-    assert "chain.py" not in {entry.path.name for entry in caught.traceback}  # the user's own alone
+    assert "propagate.py" not in {entry.path.name for entry in caught.traceback}  # the user's alone
     assert "its inputs None, as no u_t is given by inputs=" in str(caught.value)
 
 

@@ -43,7 +43,7 @@ def test_noise_and_draws_have_one_law(name):
 @pytest.mark.parametrize("spread", [0.1, 1.0, 10.0])
 def test_amcl_draws_one_by_one_until_there_are_enough_for_the_bins(spread):
     """Beside the loop of Fox (2003), table 1, with the least and the most of ROS."""
-    move, occupied, number = AdaptiveMonteCarlo(None), set(), 5000
+    move, occupied, number = AdaptiveMonteCarlo(), set(), 5000
     drawn = spread * np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32)
     for k, pose in enumerate(np.floor(drawn / np.array(move.bins, np.float32)), 1):
         occupied.add(tuple(pose))
