@@ -315,8 +315,8 @@ BUGS = {
     ),
     "conditional SMC loses its reference": Bug(
         "moves/conditional.py",
-        "particles = jax.tree.map(lambda leaf, own: put(leaf, own, slot), mixture.particles, states)",
-        "particles = mixture.particles",
+        "jax.tree.map(lambda leaf, own: put(leaf, own, slot), mixture.particles, states)",
+        "mixture.particles",
         "tests/smoothing/test_conditional.py -k 'many and components'",
     ),
     # tuning
