@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.mixture import flatten_states
+from mpfjax.mixture import flatten_states, single_component
 from mpfjax.moves.regrouping.features import ByFeatures, OnCircles
 from tests.examples import example_mixtures, log_masses
 
@@ -141,3 +141,18 @@ def test_a_stack_of_mixtures_has_no_summary_of_one(as_installed):
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf] * 40), MIXTURES["ordinary"])
     with pytest.raises(ValueError, match=r"mixture: a stack of 40 mixtures .* jax\.vmap"):
         stack.mean()
+
+
+def test_a_variance_is_about_the_mean():
+    """20 m from zero with 3 cm: E[x²] - E[x]² has no digit left, and may be negative."""
+    rng = np.random.default_rng(0)
+    places = np.float32(20 + 0.03 * rng.normal(size=(50, 2)))
+    log_weights = np.log(rng.dirichlet(np.ones(50)))
+    mixture = single_component(jnp.asarray(places)).replace(
+        log_weights=jnp.asarray(log_weights, jnp.float32)
+    )
+    mean = np.exp(log_weights) @ places.astype(float)
+    expected = np.exp(log_weights) @ (places - mean) ** 2
+    np.testing.assert_allclose(mixture.variance(mixture.particles), expected, rtol=1e-4)
+    seconds = mixture.average(mixture.particles**2) - mixture.average(mixture.particles) ** 2
+    assert np.abs(seconds / expected - 1).max() > 0.01
