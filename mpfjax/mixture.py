@@ -179,7 +179,10 @@ class ParticleMixture(eqx.Module):
     @property
     def component_effective_sample_sizes(self) -> Float[Array, " m"]:
         """1 / Σ w_i² of each component, zero for a dead one."""
-        return _inverse(self.component_sums(self.component_weights**2))
+        if self.num_components == 1:
+            return self.effective_sample_size[None]
+        squares, labels = self.component_weights**2, self.component_indicators
+        return _inverse(segment_sum(squares, labels, self.num_components))
 
     @property
     def effective_sample_size(self) -> Float[Array, ""]:

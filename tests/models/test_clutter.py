@@ -142,6 +142,29 @@ def test_chances_and_densities_may_be_functions_and_measurements_trees_of_one_pa
     assert missed == pytest.approx(np.log(1 - P_D))
 
 
+def test_chances_of_nothing_and_of_all_have_derivatives_and_periods_are_the_objects():
+    """∂ log L / ∂p of (1 - p) + p s is (s - 1) / L."""
+    states, seen = jnp.array([[0.3]]), jnp.array([[0.4], [-2.0]])
+    ratio = sum(np.exp(OBJECT.log_likelihood(y, states)[0]) for y in seen) / CLUTTER
+
+    def log_likelihood(p):
+        return ClutteredModel(OBJECT, p, CLUTTER).log_likelihood(seen, states)[0]
+
+    for p in (0.0, 0.4, 1.0):
+        expected = (ratio - 1) / (1 - p + p * ratio)
+        np.testing.assert_allclose(jax.grad(log_likelihood)(p), expected, rtol=1e-4)
+    assert ClutteredModel(Turning(), P_D, CLUTTER).periods == 2 * np.pi
+
+
+class Turning(type(OBJECT)):
+    """A class that says what goes round."""
+
+    periods = 2 * np.pi
+
+    def __init__(self):
+        super().__init__([[A]], [[Q]], [[1.0]], [[R]], [0.0], [[P0]])
+
+
 def test_what_needs_a_single_measurement_is_refused():
     for missing, make in (
         (

@@ -3,9 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import mpfjax
 from mpfjax import Every, KMeans, Merge, Propagate, Split
+from mpfjax.moves.restarts import RegroupOthers
 from tests.registry import RandomLabels
 
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
@@ -59,3 +61,54 @@ def test_a_label_that_dies_within_and_is_used_again_has_no_past():
     after = every(KEYS[0], mixture.replace(memory=memory))
     np.testing.assert_array_equal(np.unique(after.component_indicators), [0, 1, 2])
     assert after.memory["overlap_durations"][0, 1] == 0
+
+
+class Odd(mpfjax.AbstractRegrouping):
+    """A regrouping of which all is so that a filter may ask of a move."""
+
+    approximate = needs_parents = biases_score = True
+    keeps_parents = keeps_families = False
+
+    def regroup(self, key, mixture):
+        return mixture.component_indicators, mixture.memory
+
+    def initial_memory(self, model, num_components):
+        return {"odd": jnp.zeros(num_components)}
+
+    def check(self, now, num_particles, num_components):
+        raise ValueError(f"odd: {num_components}")
+
+    def would_resample(self, mixture, now):
+        return jnp.ones(mixture.num_components, bool)
+
+    def evidence_against(self, mixture, now, increment):
+        return increment + 1
+
+
+@pytest.mark.parametrize("wrapper", [lambda move: Every(1, [KMeans(), move]), RegroupOthers])
+def test_a_move_that_holds_moves_forwards_all_that_they_are(wrapper):
+    move = wrapper(Odd())
+    for name in ("approximate", "needs_parents", "biases_score", "keeps_mass"):
+        assert getattr(move, name), name
+    for name in ("keeps_parents", "keeps_families", "weighs"):
+        assert not getattr(move, name), name
+    mixture = mpfjax.ParticleMixture(
+        jnp.arange(4.0), jnp.full(4, -jnp.log(4.0)), jnp.arange(4) % 2, jnp.arange(4), 3,
+        memory=move.initial_memory(MODEL, 3),
+    )  # fmt: skip
+    assert "odd" in mixture.memory
+    now = mpfjax.Step(MODEL, jnp.float32(1.0))
+    assert move.would_resample(mixture, now).all()
+    assert move.evidence_against(mixture, now, jnp.float32(1.0)) == 2
+    with pytest.raises(ValueError, match="odd"):
+        move.check(now, 4, 3)
+
+
+def test_a_resampling_from_time_to_time_leaves_the_choice_of_x_0_alone():
+    moves = [Every(1, [mpfjax.Resample()]), Propagate()]
+    filter = mpfjax.with_selected_start(mpfjax.Filter(MODEL, moves, 64), 4)
+    run = mpfjax.run_filter(KEYS[0], filter, OBSERVATIONS)
+    assert not run.resampled[0]
+    assert run.resampled[1]
+    first = jax.tree.map(lambda leaf: leaf[0], run.collected)
+    np.testing.assert_array_equal(first.ancestor_indices, np.arange(64))

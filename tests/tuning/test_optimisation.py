@@ -226,6 +226,11 @@ class TestBias:
         with pytest.warns(UserWarning, match='fit: .* score of r is biased.*gradient="stop"'):
             self.warn(filter, parameters)
 
+    def test_a_draw_that_is_kept_of_several_biases_it(self):
+        moves = [mpfjax.Resample(gradient="stop"), mpfjax.PropagateNested(mpfjax.Propagate())]
+        with pytest.warns(UserWarning, match="fit: PropagateNested has no gradient"):
+            self.warn(mpfjax.Filter(ScalarLinear(), moves, 16))
+
     def test_what_is_right_is_not(self):
         with warnings.catch_warnings(action="error"):
             self.warn(mpfjax.particle_filter(ScalarLinear(), 16, gradient="stop"))
