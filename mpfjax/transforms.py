@@ -112,7 +112,7 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
     def nested(move: Any) -> Any:
         if not isinstance(move, AbstractPropagationOfEach):
             return move
-        plain = move.propagate if isinstance(move, PropagateNested) else move
+        plain: Any = move.propagate if isinstance(move, PropagateNested) else move
         return plain if num_draws == 1 else PropagateNested(plain, num_draws)
 
     return _map_chain(nested, filter)

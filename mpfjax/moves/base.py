@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -71,7 +71,7 @@ class AbstractMove(Given):
     biases_score = False
     """whether it redraws particles in a way that derivatives in the model's parameters do not see,
     so that the score is biased."""
-    holds = ()
+    holds: ClassVar[tuple[str, ...]] = ()
     """the names of the fields with the moves that it runs; see `AbstractWrapper`."""
 
     @abc.abstractmethod
@@ -246,11 +246,11 @@ class AbstractResampling(AbstractMove):
 
 def unless_waiting(resampled: ParticleMixture, mixture: ParticleMixture) -> ParticleMixture:
     """The mixture resampled, or as it was where it waits for an observation."""
-    if mixture.waits is None:
+    if (waits := mixture.waits) is None:
         return resampled
     # Not by a condition, which would copy all that goes through it at every step.
     return jax.tree.map(
-        lambda new, old: new if new is old else jnp.where(mixture.waits, old, new),
+        lambda new, old: new if new is old else jnp.where(waits, old, new),
         resampled,
         mixture.replace(in_order=resampled.in_order),
     )
