@@ -158,11 +158,11 @@ class Clock:
 
     def over(self, part: str, items: Iterable[Any]) -> Iterator[Any]:
         """Yield the items, and count the time that each takes to arrive for this part."""
-        iterator = iter(items)
+        iterator, end = iter(items), object()
         while True:
             with self.of(part):
-                item = next(iterator, None)
-            if item is None:
+                item = next(iterator, end)
+            if item is end:
                 return
             yield item
 

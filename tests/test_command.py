@@ -144,6 +144,19 @@ def test_some_frames_of_a_video_without_colours_or_truth(sequence, tmp_path):
     assert frame_files.frame_rate(out / "tracking.mp4") == 12.5
 
 
+def test_frames_that_cannot_be_decoded_are_in_all_that_is_written(given, tmp_path, monkeypatch):
+    def damaged(path, first, last):
+        for number, frame in enumerate(read_frames(path, first, last), first):
+            yield None if number in (3, 4) else frame
+
+    monkeypatch.setattr(frame_files, "read_frames", damaged)
+    assert run(*given, "--out", tmp_path) == 0
+    monkeypatch.undo()
+    assert summary_in(tmp_path)["frames"] == NUM_FRAMES
+    assert len(list(read_frames(tmp_path / "tracking.mp4"))) == NUM_FRAMES
+    assert read_tracks(tmp_path / "tracks.txt")[-1, 0] == NUM_FRAMES
+
+
 def test_the_folder_of_the_results_may_be_a_time(given, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run(*given, "--out", "06:47") == 0

@@ -152,7 +152,9 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
     """The requested tracker; raises for any fault in the arguments."""
     options, source = results.options, results.source
     key = jax.random.key(options.seed)
-    if options.box is not None and still is not None:
+    if options.box is not None and still is None:
+        raise ValueError(f"--box: frame {source.first}, in which they are, cannot be decoded")
+    if options.box is not None:
         boxes = results.drawn = read_boxes(options, still)
         return lambda stills: follow_boxes(stills or (), boxes, key=key)
     rows = None if source.rows is None else Rows(source.rows, last=source.last)
@@ -183,11 +185,11 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
 def _track(results: Results, start: Start) -> None:
     """The loop over frames."""
     options, source, clock = results.options, results.source, results.clock
-    unwritten: collections.deque[np.ndarray] = collections.deque()  # frames without tracks as yet
+    untracked: collections.deque[np.ndarray | None] = collections.deque()
 
     def watched(stills: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
         for still in results.ahead.over("read", stills):
-            unwritten.append(still)
+            untracked.append(still)
             yield still
 
     bar = tqdm(total=source.num_frames, desc="Tracking", unit="frame", disable=None)
@@ -204,7 +206,7 @@ def _track(results: Results, start: Start) -> None:
         # Closed before the thread that reads ends: it may wait for a frame.
         tracked = opened.enter_context(contextlib.closing(start(stills)))
         for tracks in clock.over("track", tracked):
-            still = unwritten.popleft() if source.has_pixels else None
+            still = untracked.popleft() if source.has_pixels else None
             rows = results.add(tracks)
             with clock.of("write"):
                 if file is None:
@@ -222,10 +224,18 @@ def _track(results: Results, start: Start) -> None:
 @contextlib.contextmanager
 def _video(path: Path, frames_per_second: float | None) -> Iterator[Callable[..., None]]:
     """A function that draws rows on a frame of a new video, in a thread of its own."""
+    unwritten: collections.deque[np.ndarray] = collections.deque()
+    latest = None
+
     with frames.open_video(path, frames_per_second or 10.0) as append:
 
-        def draw(still: np.ndarray, rows: np.ndarray) -> None:
-            append(drawing.with_tracks(still, rows))
+        def draw(still: np.ndarray | None, rows: np.ndarray) -> None:
+            nonlocal latest
+            latest = latest if still is None else still
+            unwritten.append(rows)
+            # In the place of a frame that cannot be decoded, the one before it, or after it.
+            while latest is not None and unwritten:
+                append(drawing.with_tracks(latest, unwritten.popleft()))
 
         with write_behind(draw) as hand_over:
             yield hand_over

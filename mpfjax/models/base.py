@@ -157,7 +157,7 @@ def asking(model: Any, method: str, given: str = "") -> Iterator[None]:
         clauses = [f"given {given}"] if given else []
         is_users = not type(model).__module__.startswith("mpfjax.")
         if getattr(model, "inputs", ()) is None and is_users:
-            clauses.append("its inputs None, as no u_t is given by inputs= or a Series")
+            clauses.append("its inputs None, as the call gives no u_t")
         with saying(f"model: {model_name(model)}.{method}", ", ".join(clauses)):
             raise
 

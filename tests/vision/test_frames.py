@@ -132,15 +132,44 @@ def test_an_unreadable_file_is_named(tmp_path, name):
     assert "\n" not in str(raised.value)
 
 
-def test_a_damaged_stretch_of_a_video_is_said(tmp_path):
-    noise = np.random.default_rng(0).integers(0, 256, (40, 32, 48, 3), dtype=np.uint8)
-    at_times(tmp_path / "damaged.mp4", list(range(0, 800, 20)), noise)
-    content = bytearray((tmp_path / "damaged.mp4").read_bytes())
+@pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
+def test_frames_after_a_damaged_one_keep_their_numbers(tmp_path, codec):
+    """With frames that are decoded in another order than they are shown in."""
+    av = pytest.importorskip("av", reason="the extra 'video' is missing")
+    path = tmp_path / "damaged.mp4"
+    noise = np.random.default_rng(0).integers(0, 256, (40, 64, 96, 3), dtype=np.uint8)
+    with av.open(str(path), "w") as video:
+        stream = video.add_stream(codec, rate=25, options={"bf": "2"})
+        stream.height, stream.width, stream.pix_fmt = *noise.shape[1:3], "yuv420p"
+        for still in noise:
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(still, format="rgb24")))
+        video.mux(stream.encode())
+    whole = np.stack(list(read_frames(path))).astype(int)
+    content = bytearray(path.read_bytes())
     middle = len(content) // 2
     content[middle : middle + 3000] = bytes(3000)
-    (tmp_path / "damaged.mp4").write_bytes(content)
-    with pytest.warns(RuntimeWarning, match=r"damaged\.mp4: some frames are damaged"):
-        assert 0 < len(list(read_frames(tmp_path / "damaged.mp4"))) < 40
+    path.write_bytes(content)
+    with pytest.warns(RuntimeWarning, match=r"damaged\.mp4: \d+ frames are too dam") as warned:
+        frames = list(read_frames(path))
+    damaged = [number for number, frame in enumerate(frames, 1) if frame is None]
+    assert f" {len(damaged)} frames" in str(warned[0].message)
+    assert str(warned[0].message).endswith(f": {', '.join(map(str, damaged))}")
+    assert len(frames) == len(whole) == 40
+    assert 0 < len(damaged) < 10
+    after = [
+        number
+        for number in range(max(damaged), 40)
+        if np.array_equal(np.abs(whole - frames[number]).mean(axis=(1, 2, 3)).argmin(), number)
+    ]
+    assert len(after) == 40 - max(damaged)
+    assert next(read_frames(path, damaged[0], damaged[0])) is None
+
+
+def test_a_video_shows_the_frame_before_one_that_is_not_there(tmp_path):
+    first, second = shades(2)
+    write_video(tmp_path / "gaps.mp4", [None, first, None, None, second])
+    values = [int(frame.mean()) for frame in read_frames(tmp_path / "gaps.mp4")]
+    assert np.abs(np.array(values) - [20, 20, 20, 20, 220]).max() <= 8
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "1", "I;16", "P", "RGBA"])

@@ -193,6 +193,22 @@ def test_an_error_of_the_detector_says_in_which_frame():
     assert "detector at frame 2" in str(caught.value)
 
 
+def test_a_damaged_frame_is_predicted_and_later_ones_keep_their_numbers():
+    frames, asked = [*stills()], []
+    frames[2] = None
+
+    def detector(frame):
+        asked.append(frame)
+        return [[10.0 + len(asked), 10, 12, 20]]
+
+    tracks = list(track(frames, detector, TRACKER))
+    assert len(tracks) == len(frames) == len(asked) + 1
+    assert all(1 in each.identities for each in tracks)
+    assert [bool((each.detections >= 0).any()) for each in tracks] == [
+        frame is not None for frame in frames
+    ]
+
+
 # --- which detection is whose ---------------------------------------------------------------------
 
 

@@ -1,6 +1,7 @@
 """Frames in and out: folders of images through Pillow, video files through PyAV."""
 
 import contextlib
+import heapq
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -17,6 +18,7 @@ from mpfjax.vision.files.sequences import read_sequence_info
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 # The folder of images in a sequence; MOTChallenge's is the second.
 _INNER = ("img", "img1")
+_SOME = 20  # as many numbers are said
 # In half to .7 of the time of the preset "fast" at rate 20, with the same quality to .1 dB, in
 # files a tenth larger.
 _X264 = {"crf": "19", "preset": "veryfast", "x264-params": "rc-lookahead=30:subme=4"}
@@ -25,13 +27,14 @@ _X264 = {"crf": "19", "preset": "veryfast", "x264-params": "rc-lookahead=30:subm
 @checked
 def read_frames(
     path: str | Path, first: Count = 1, last: Count | None = None
-) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+) -> Iterator[UInt8[np.ndarray, "h w 3"] | None]:
     """Read frames `first` to `last`, both included and counted from 1, in RGB, one at a time.
 
     `path` is a video file, a folder of images in the natural order of their names (2.png before
     10.png), or a folder with such a folder `img` or `img1`. All frames of a video are read,
-    whatever the time between them; both are rotated as the file says. A `RuntimeWarning` names
-    those that are too damaged to be decoded. Raises `ImportError` if PyAV is missing for a video,
+    whatever the time between them; both are rotated as the file says. None stands for a frame that
+    is too damaged to be decoded, so that those after it keep their numbers; a `RuntimeWarning` at
+    the end has the number and the count of these. Raises `ImportError` without PyAV for a video,
     `FileNotFoundError` where there is nothing, and `ValueError` with `path` if it cannot be read,
     has no frames, or has frames of different sizes, and for `first` and `last` that are no range.
     """
@@ -81,15 +84,16 @@ def frame_rate(path: str | Path) -> float | None:
 @checked
 def write_video(
     path: str | Path,
-    frames: Iterable[UInt8[np.ndarray, "h w 3"]],
+    frames: Iterable[UInt8[np.ndarray, "h w 3"] | None],
     frames_per_second: Positive = 10.0,
 ) -> None:
     """Write RGB frames to an MP4 or, by the ending of `path`, a GIF that loops.
 
-    Raises `ValueError` for another ending, frames that are no images of one size and a rate that is
-    not positive, `ImportError` where PyAV is missing for an MP4.
+    In the place of None, a frame that could not be decoded, is the one before it. Raises
+    `ValueError` for another ending, frames that are no images of one size and a rate that is not
+    positive, `ImportError` where PyAV is missing for an MP4.
     """
-    stills = of_one_kind(frames)
+    stills = without_gaps(of_one_kind(frames))
     if Path(path).suffix.lower() == ".gif":
         from PIL import Image
 
@@ -141,15 +145,18 @@ def check_frame(frame: Any, argument: str = "frame") -> None:
 
 
 def of_one_kind(
-    frames: Iterable[UInt8[np.ndarray, "..."]], first: int = 1, argument: str = "frames"
-) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    frames: Iterable[UInt8[np.ndarray, "..."] | None], first: int = 1, argument: str = "frames"
+) -> Iterator[Any]:
     """The frames in RGB, also from grey ones; errors name frames by their number from `first` on.
 
-    Raises `ValueError` at the first frame that is no image of eight bits, or of another size than
-    the frames before it.
+    None, for a frame that cannot be decoded, stays. Raises `ValueError` at the first frame that is
+    no image of eight bits, or of another size than the frames before it.
     """
     shape = None
     for number, frame in enumerate(frames, first):
+        if frame is None:
+            yield None
+            continue
         frame = np.asarray(frame)
         if frame.ndim == 2 or frame.shape[2:] == (1,):
             frame = np.repeat(frame.reshape(*frame.shape[:2], 1), 3, axis=2)
@@ -158,6 +165,16 @@ def of_one_kind(
         if frame.shape != shape:
             raise ValueError(f"{argument}: {number} has the shape {frame.shape}, others {shape}")
         yield frame
+
+
+def without_gaps(frames: Iterable[Any]) -> Iterator[Any]:
+    """The frames with the one before it in the place of None, or the first of all after it."""
+    latest, waiting = None, 0
+    for frame in frames:
+        latest, waiting = latest if frame is None else frame, waiting + 1
+        while latest is not None and waiting:
+            waiting -= 1
+            yield latest
 
 
 def _image_paths(folder: Path) -> list[Path]:
@@ -188,37 +205,61 @@ def _read_images(folder: Path, first: int, last: int | None) -> Iterator[np.ndar
         yield frame
 
 
-def _read_video(path: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
-    number = 0
+def _read_video(path: Path, first: int, last: int | None) -> Iterator[np.ndarray | None]:
+    number, damaged = 0, []
     for number, frame in enumerate(_decoded(path), 1):
-        if number >= first:
+        if number >= first and frame is None:
+            damaged.append(number)
+            yield None
+        elif number >= first:
             with _naming(path, "a video"):
                 image = _upright(frame)
             yield image
         if number == last:
-            return
+            break
     if number < first:
         raise ValueError(f"{path}: holds {number} frames, frame {first} is not among them")
+    if damaged:
+        numbers = ", ".join(map(str, damaged[:_SOME])) + ", ..." * (len(damaged) > _SOME)
+        warn(f"{path}: {len(damaged)} frames are too damaged to be decoded: {numbers}")
 
 
 def _decoded(path: Path) -> Iterator[Any]:
-    """The frames of a video, their pixels not yet converted."""
+    """The frames of a video, their pixels not yet converted; None for each that is damaged.
+
+    A frame comes later than its packet, and in another order. One that never comes is told by its
+    time, which lies before that of a frame that has come. Where a file's times are not in order,
+    None comes as soon as a packet cannot be decoded.
+    """
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
-        packets, damaged = container.demux(stream), False
+        packets, coming, latest, in_order = container.demux(stream), [], -math.inf, True
+        # Sound files have packets without a frame as well, as before a first whole picture. Only
+        # decoders of AV1 say nothing of damage.
+        is_damaged = stream.codec_context.name == "libdav1d"
         while True:
             with _naming(path, "a video"):
                 packet = next(packets, None)
             if packet is None:
                 break
+            if packet.size and not packet.is_discard:
+                in_order &= packet.pts is not None
+                heapq.heappush(coming, packet.pts or 0)
             try:
                 frames = packet.decode()
             except (OSError, ValueError):  # the library's error for a damaged packet
-                damaged = True
-                continue
-            yield from frames
-    if damaged:
-        warn(f"{path}: some frames are damaged, and were left out")
+                is_damaged, frames = True, []
+                if not in_order:
+                    yield None
+            for frame in frames:
+                in_order &= frame.pts is not None and frame.pts > latest
+                while in_order and coming and coming[0] <= frame.pts:
+                    if heapq.heappop(coming) < frame.pts and is_damaged:
+                        yield None
+                latest = frame.pts
+                yield frame
+        if is_damaged and in_order:
+            yield from [None] * len(coming)
 
 
 def _url(path: str | Path) -> str:

@@ -94,7 +94,9 @@ def observed(
         return
     coming = iter(()) if callable(detector) else iter(detector)
     for number, still in frames:
-        if callable(detector):
+        if callable(detector) and still is None:  # it cannot be decoded
+            found = []
+        elif callable(detector):
             with saying(f"detections: raised by the detector at frame {number}"):
                 found = detector(still)
         else:

@@ -34,7 +34,7 @@ _FEW_OBJECTS = 48
 
 @checked
 def track(
-    frames: Iterable[UInt8[np.ndarray, "..."]] | str | Path | None,
+    frames: Iterable[UInt8[np.ndarray, "..."] | None] | str | Path | None,
     detections: Any,
     tracker: ObjectTracker | None = None,
     *,
@@ -58,7 +58,7 @@ def track(
 
     - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable, or the
       path of a video or of a folder of images, from frame `first` on; None where there are only
-      detections.
+      detections. A frame that is None, as `read_frames` has it for a damaged one, is predicted.
     - `detections`: a function from a frame to its boxes (x, y, w, h), top-left corner first, in
       pixels, or to a tuple of boxes and scores (None for none), or of boxes, scores and classes;
       or an iterable of these, one item for each frame; or an array of rows (frame, id, x, y, w, h,
