@@ -198,14 +198,14 @@ BUGS = {
     ),
     "the cost of a pair has no determinant": Bug(
         "vision/tracking/associate.py",
-        "return tails + jnp.minimum(volumes, _WIDEST)[:, None]",
+        "return tails + np.minimum(volumes, _WIDEST)[:, None]",
         "return tails",
         "tests/vision/test_association.py -k density",
     ),
     "objects end a frame too early": Bug(
         "vision/tracking/lives.py",
-        "stays = self.alive & inside & (unseen <= most)",
-        "stays = self.alive & inside & (unseen < most)",
+        "return lives, unseen <= most",
+        "return lives, unseen < most",
         "tests/vision/test_tracker.py -k outlives",
     ),
     "no chain of weak scores is an object's": Bug(
@@ -216,14 +216,14 @@ BUGS = {
     ),
     "objects move against the camera": Bug(
         "vision/tracking/tracker.py",
-        "return objects.shifted(shift), noise, camera, away + (jolt + shift)[None]",
-        "return objects.shifted(-shift), noise, camera, away + (jolt + shift)[None]",
+        "objects = state.objects.shifted(shift)",
+        "objects = state.objects.shifted(-shift)",
         "tests/vision/test_tracker.py -k shaking",
     ),
     "births do not know the frame rate": Bug(
         "vision/tracking/noise.py",
-        "start: Any = np.float32(min(25 / frames_per_second, _MOST)) * _SPEED",
-        "start: Any = np.float32(1.0) * _SPEED",
+        "start = min(25 / frames_per_second, _MOST) * _SPEED",
+        "start = 1.0 * _SPEED",
         "tests/vision/test_tracker.py -k rare",
     ),
     # Propagation, several objects, look-aheads.

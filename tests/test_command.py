@@ -96,8 +96,8 @@ def test_all_that_is_promised_is_written(sequence, finished):
     }  # fmt: skip
     rows, summary = read_tracks(finished / "tracks.txt"), summary_in(finished)
     assert list(summary) == [
-        "frames", "objects", "frames_without_room", "seconds", "frames_per_second",
-        "peak_memory_mb", *SCORES,
+        "frames", "objects", "frames_without_room", "detections_left_out", "seconds",
+        "frames_per_second", "peak_memory_mb", *SCORES,
     ]  # fmt: skip
     assert list(summary["seconds"]) == ["read", "detect", "track", "write"]
     assert summary["seconds"]["track"] > summary["seconds"]["detect"] >= 0

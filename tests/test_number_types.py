@@ -107,7 +107,8 @@ TAKEN = {
     "average": (MIXTURE.average, [0, 100, 200, 255]),
     "component_sums": (MIXTURE.component_sums, [0, 100, 200, 255]),
     "Detections": (
-        lambda x: Detections.from_boxes(x, 3), [[2.0, 3.0, 4.0, 5.0], [6.0, 1.0, 2.0, 2.0]]
+        lambda x: np.asarray(Detections.of(x, "boxes").boxes),
+        [[2.0, 3.0, 4.0, 5.0], [6.0, 1.0, 2.0, 2.0]],
     ),
     "kalman_filter": (lambda x: kalman_filter(KNOWN, x), [[1], [2], [3]]),
     "step": (lambda x: FILTER.step(jax.random.key(0), MIXTURE, x)[1], [2]),

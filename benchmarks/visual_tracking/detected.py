@@ -1,6 +1,7 @@
 """Tracking without a drawn box: detections, and mixtures whose components are born of them."""
 
 from collections.abc import Iterable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,30 +15,32 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractPropagation
 from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
 from mpfjax.vision.boxes.following import Snapshot
-from mpfjax.vision.tracking.gaussian import Gaussian, boxes_of, places_of, units
-from mpfjax.vision.tracking.state import TrackerState
+from mpfjax.vision.tracking.detections import Found
+from mpfjax.vision.tracking.gaussian import Gaussian, places_of, units
 from mpfjax.vision.tracking.track import offline_rows
-from mpfjax.vision.tracking.tracker import WEAK_ERROR, advanced, colours_of
+from mpfjax.vision.tracking.tracker import WEAK_ERROR, advanced, coloured
 
 MAX_DETECTIONS, MAX_OBJECTS, PARTICLES = 32, 24, 16
-DECIDED = "decided"
 # Weights within a component differ by at most the factor e^30.
 FARTHEST = 30.0
 
 
 class Seen(NamedTuple):
-    """A frame: its detections, and their colours."""
+    """What the detections say of each of M components, as a tracker decided it.
 
-    detections: Detections
-    colours: Any
+    - `place`: (M, 4), of its detection; `there`, `born`: (M,), whether there is any, and whether
+      the component begins there; `probability`: (M,), that the detection is its own.
+    - `error`, `speed`: (M, 4), deviations of the detection, and of the velocity of a new object.
+    - `noises`: (2, 4), deviations of place and velocity, in boxes.
+    """
 
-
-class Decided(NamedTuple):
-    """What the detections say of the components: the tracker's state and tracks, and births."""
-
-    tracker: TrackerState
-    tracks: Tracks
-    born: Array
+    place: Any
+    there: Any
+    born: Any
+    probability: Any
+    error: Any
+    speed: Any
+    noises: Any
 
 
 class NobodyYet(mpfjax.AbstractStateSpaceModel):
@@ -46,7 +49,8 @@ class NobodyYet(mpfjax.AbstractStateSpaceModel):
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Gaussian:
         """Boxes of one pixel."""
         del key
-        return Gaussian(*(jnp.zeros((num_particles, 4)) for _ in Gaussian._fields))
+        zero: Any = jnp.zeros((num_particles, 4))
+        return Gaussian(zero, zero, zero, zero, zero)
 
     def sample_transition(self, key: Key[Array, ""], states: Gaussian) -> Gaussian:
         """The same."""
@@ -74,42 +78,6 @@ class Seats(AbstractMove):
         return mixture.replace(component_indicators=seats)
 
 
-class Decide(AbstractMove):
-    """Which detection each component has, which components end and which begin.
-
-    As an `ObjectTracker` decides it, with the moments of the particles in the place of its own.
-    """
-
-    tracker: ObjectTracker
-    start: TrackerState
-    approximate = True
-    weighs = False
-    keeps_mass = True
-
-    def initial_memory(
-        self, model: mpfjax.AbstractStateSpaceModel, num_components: int
-    ) -> dict[str, Any]:
-        """Nobody, and no detection."""
-        del model
-        m, none = num_components, jnp.zeros(num_components, jnp.int32)
-        never = jnp.zeros(m, bool)
-        boxes, full, unsure = jnp.zeros((m, 4)), jnp.zeros((), bool), jnp.zeros(m)
-        tracks = Tracks(boxes, none, never, none, full, never, none - 1, unsure, none)
-        return {DECIDED: Decided(self.start, tracks, never)}
-
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: mpfjax.Step
-    ) -> ParticleMixture:
-        """Remember what is decided."""
-        seen: Seen = now.observation
-        before = mixture.memory[DECIDED].tracker
-        state = before._replace(objects=moments(mixture))
-        state, tracks = advanced(self.tracker, state, seen.detections, seen.colours)
-        born = (tracks.identities > 0) & (tracks.identities != before.lives.identities)
-        decided = {DECIDED: Decided(state, tracks, born)}
-        return mixture.replace(memory=mixture.memory | decided)
-
-
 class FollowDetections(AbstractPropagation):
     """Predict every hypothesis, update it by its component's detection, and weigh it.
 
@@ -134,57 +102,95 @@ class FollowDetections(AbstractPropagation):
         self, key: Key[Array, ""], mixture: ParticleMixture, now: mpfjax.Step
     ) -> ParticleMixture:
         """Follow the detections, and begin components."""
-        decided, found = mixture.memory[DECIDED], now.observation.detections
-        noises, owner = decided.tracker.noise.noises, mixture.component_indicators
-        assert found.rows is not None  # `from_boxes` says them
-        mine = found.rows[None] == decided.tracks.detections[:, None]
-        rows = jnp.argmax(mine, axis=1)
-        place, there = places_of(found.boxes[rows]), jnp.any(mine, axis=1)[owner]
-        weak = found.scores[rows] < decided.tracker.scores.strong
-        unit = units(place)
-        error = unit * noises.errors[None]
-        wide = error * jnp.where(weak, WEAK_ERROR, 1.0)[:, None]
-        moved = mixture.particles.predicted(noises.place[None], noises.velocity[None])
-        updated, gap, variance = moved.updated(place[owner], wide[owner])
+        seen, owner = now.observation, mixture.component_indicators
+        place, error = seen.place[owner], seen.error[owner]
+        sizes = jnp.exp(mixture.particles.place[:, 2:])
+        unit = jnp.concatenate([sizes, jnp.ones_like(sizes)], axis=1)
+        with jax.numpy_rank_promotion("allow"):
+            moved = mixture.particles.predicted(*seen.noises, unit)
+        updated, gap, variance = moved.updated(place, error)
         log_z = -0.5 * jnp.sum(gap**2 / variance + jnp.log(variance), axis=1)
         offset = log_z - mixture.component_averages(log_z)[owner]
         ratio = jnp.exp(jnp.clip(offset, -FARTHEST, FARTHEST))
-        p = decided.tracks.probabilities[owner]
+        p = seen.probability[owner]
         own = p * ratio / mixture.component_averages(ratio)[owner]
-        factor = jnp.where(there, own + 1 - p, 1.0)
-        share = jnp.where(there, own / factor, 0.0)
+        factor = jnp.where(seen.there[owner], own + 1 - p, 1.0)
+        share = jnp.where(seen.there[owner], own / factor, 0.0)
         if not self.matched:
             share = jnp.where(jax.random.uniform(key, share.shape) < share, 1.0, 0.0)
         particles = updated.mixed_with(moved, share[:, None])
-        begun = Gaussian.begun(place, error, unit * noises.speed[None])
-        begun = Gaussian(*(moment[owner] for moment in begun))
-        born = decided.born[owner]
+        begun, born = Gaussian.begun(place, error, seen.speed[owner]), seen.born[owner]
+        particles = jax.tree.map(partial(jnp.where, born[:, None]), begun, particles)
         weights = jnp.where(born, 1.0, mixture.component_weights * factor)
         total = mixture.replace(log_weights=jnp.log(weights))
         log_weights = jnp.log(total.component_weights / MAX_OBJECTS)
-        return mixture.replace(particles=begun.where(born, particles), log_weights=log_weights)
+        return mixture.replace(particles=particles, log_weights=log_weights)
 
 
 def moments(mixture: ParticleMixture) -> Gaussian:
     """Those of each component: of the mixture of its particles' Gaussians."""
     particles, owner = mixture.particles, mixture.component_indicators
-    place, velocity, *spread = (mixture.component_averages(row) for row in particles)
-    away, away_velocity = particles.place - place[owner], particles.velocity - velocity[owner]
+    means: Any = jax.tree.map(mixture.component_averages, particles)
+    away = particles.place - means.place[owner]
+    away_velocity = particles.velocity - means.velocity[owner]
     products = away**2, away * away_velocity, away_velocity**2
-    between = (mixture.component_averages(row) for row in products)
-    return Gaussian(place, velocity, *(a + b for a, b in zip(spread, between, strict=True)))
+    spread = (a + mixture.component_averages(b) for a, b in zip(means[2:], products, strict=True))
+    return Gaussian(means.place, means.velocity, *spread)
+
+
+class Decider:
+    """Which detection each component has, which components end and which begin, in one run.
+
+    As an `ObjectTracker` decides it, with the moments of the particles in the place of its own.
+    """
+
+    def __init__(self) -> None:
+        self.tracker = ObjectTracker(MAX_OBJECTS)
+        self.state, self.seats = self.tracker.init(), dict[int, int]()  # by identity
+
+    def decide(self, moments: Gaussian, found: Found) -> tuple[Tracks, Seen]:
+        """The tracks, a row for each component, and what its particles need of them."""
+        own = [self.seats[name] for name in self.state.lives.identities.tolist()]
+        state = self.state._replace(objects=moments.at(np.array(own, int)))
+        self.state, tracks = advanced(self.tracker, state, found)
+        names = tracks.identities.tolist()
+        kept = {name: seat for name, seat in self.seats.items() if name in names}
+        free = [seat for seat in range(MAX_OBJECTS) if seat not in kept.values()]
+        new = [name for name in names if name not in kept]
+        self.seats = kept | dict(zip(new, free, strict=False))
+        born = np.isin(np.arange(MAX_OBJECTS), free[: len(new)])
+        rows = np.full(MAX_OBJECTS, -1)
+        rows[[self.seats[name] for name in names]] = np.arange(len(names))
+        # A row more, the last, stands for nobody.
+        filled = {
+            name: np.pad(value, [(0, 1)] + [(0, 0)] * (np.ndim(value) - 1))[rows]
+            for name, value in tracks._asdict().items() if np.ndim(value)
+        }  # fmt: skip
+        filled["detections"] = np.where(rows >= 0, filled["detections"], -1)
+        tracks = tracks._replace(**filled)
+        return tracks, self._seen(tracks, found, born)
+
+    def _seen(self, tracks: Tracks, found: Found, born: np.ndarray) -> Seen:
+        noises, there = self.state.noise.noises, tracks.detections >= 0
+        rows = np.argmax(found.rows == tracks.detections[:, None], axis=1) if len(found.rows) else 0
+        boxes = np.where(there[:, None], np.append(found.boxes, np.ones((1, 4)), axis=0)[rows], 1.0)
+        weak = there & (np.append(found.scores, 0.0)[rows] < self.state.scores.strong)
+        unit = units(places_of(boxes))
+        return Seen(
+            places_of(boxes), there, born, tracks.probabilities,
+            unit * noises.errors * np.where(weak & ~born, WEAK_ERROR, 1.0)[:, None],
+            unit * noises.speed, np.stack([noises.place, noises.velocity]),
+        )  # fmt: skip
 
 
 def make_mixtures() -> dict[str, mpfjax.Filter]:
     """The same chain with resampling and with Gaussian regeneration."""
-    tracker = ObjectTracker(MAX_OBJECTS)
 
     def chain(resampling: AbstractMove, matched: bool) -> mpfjax.Filter:
-        moves = Decide(tracker, tracker.init()), resampling, FollowDetections(matched)
-        size = MAX_OBJECTS * PARTICLES
+        moves, size = (resampling, FollowDetections(matched)), MAX_OBJECTS * PARTICLES
         return mpfjax.Filter(NobodyYet(), moves, size, MAX_OBJECTS, initial_moves=[Seats()])
 
-    def motion(states: Gaussian) -> tuple[Array, Array]:
+    def motion(states: Gaussian) -> tuple[Any, Any]:
         return states.place, states.velocity
 
     regenerated = mpfjax.GaussianRegeneration(PARTICLES, where=motion, noise="stratified")
@@ -195,41 +201,53 @@ def make_mixtures() -> dict[str, mpfjax.Filter]:
 
 
 def follow_detected(
-    filter: mpfjax.Filter, keys: Array, stills: Iterable[np.ndarray], kept: list[Tracks]
+    filter: mpfjax.Filter, keys: Array, stills: Iterable[np.ndarray], kept: list[list[Tracks]]
 ) -> Iterator[Snapshot]:
     """A snapshot of the runs of a mixture for each frame, whose tracks go into `kept`."""
     detector = BackgroundSubtraction()
+    deciders = [Decider() for _ in keys]
     mixtures = jax.vmap(filter.init)(keys)
     for t, still in enumerate(stills):
-        found = Detections.from_boxes(detector.detect(still), MAX_DETECTIONS)
-        seen = Seen(found, colours_of(still, found))
-        mixtures, *done = _advance(filter, keys, jnp.asarray(t), mixtures, seen)
-        tracks, snapshot = jax.tree.map(np.asarray, done)
-        kept.append(tracks)
-        yield snapshot
+        boxes = Detections(detector.detect(still)[:MAX_DETECTIONS])
+        found = coloured(Found.of(boxes, f"detections: frame {t + 1}", still.shape[:2]), still)
+        means = jax.tree.map(np.asarray, _moments(mixtures))
+        decided = [each.decide(means.at(run), found) for run, each in enumerate(deciders)]
+        seen = jax.tree.map(lambda *leaves: np.stack(leaves).astype(_kind(leaves[0])),
+                            *(of_run for _, of_run in decided))  # fmt: skip
+        mixtures, boxes, points, owner = _advance(filter, keys, jnp.asarray(t), mixtures, seen)
+        tracks = [of_run for of_run, _ in decided]
+        shown = np.stack([of_run.shown for of_run in tracks])
+        alive = np.stack([of_run.identities > 0 for of_run in tracks])
+        labels = np.where(np.take_along_axis(alive, owner, axis=1), owner, -1)
+        kept.append([
+            each._replace(boxes=np.asarray(its)) for each, its in zip(tracks, boxes, strict=True)
+        ])  # fmt: skip
+        yield Snapshot(np.asarray(boxes), shown, np.asarray(points), labels)
 
 
 def rows_of_tracks(
-    kept: list[Tracks], first: int, num_runs: int, snapshots: list[Snapshot]
+    kept: list[list[Tracks]], first: int, num_runs: int, snapshots: list[Snapshot]
 ) -> list[np.ndarray]:
     """The rows of each run's tracks, as many frames as there are snapshots."""
-    rows, tracked = [], kept[: len(snapshots)]
-    for run in range(num_runs):
-        own = (jax.tree.map(lambda leaf, run=run: leaf[run], each) for each in tracked)
-        rows.append(offline_rows(own, first))
-    return rows
+    tracked = kept[: len(snapshots)]
+    return [offline_rows([each[run] for each in tracked], first) for run in range(num_runs)]
+
+
+def _kind(leaf: np.ndarray) -> type:
+    return bool if leaf.dtype == bool else np.float32
+
+
+@eqx.filter_jit
+def _moments(mixtures: ParticleMixture) -> Gaussian:
+    return jax.vmap(moments)(mixtures)
 
 
 @eqx.filter_jit
 def _advance(filter, keys, t, mixtures, seen):
-    def step(key, mixture):
-        mixture, _ = filter.step(jax.random.fold_in(key, t), mixture, seen)
-        tracks = mixture.memory[DECIDED].tracks
-        means = boxes_of(mixture.component_averages(mixture.particles.place))
-        owner = mixture.component_indicators
-        labels = jnp.where(tracks.identities[owner] > 0, owner, -1)
-        points = mixture.particles.place[:, :2]
-        snapshot = Snapshot(means, tracks.shown, points, labels)
-        return mixture, tracks._replace(boxes=means), snapshot
+    def step(key, mixture, of_run):
+        mixture, _ = filter.step(jax.random.fold_in(key, t), mixture, of_run)
+        place = mixture.component_averages(mixture.particles.place)
+        boxes = jnp.concatenate([place[:, :2], jnp.exp(place[:, 2:])], axis=1)
+        return mixture, boxes, mixture.particles.place[:, :2], mixture.component_indicators
 
-    return jax.vmap(step)(keys, mixtures)
+    return jax.vmap(step)(keys, mixtures, seen)

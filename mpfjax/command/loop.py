@@ -45,11 +45,11 @@ class Results:
         self.options, self.source = options, source
         # Seconds that the run waits, and those of the thread that is ahead of it.
         self.clock, self.ahead = Clock("track", "write"), Clock("read", "detect")
-        self.compiling = 0.0  # seconds until the first tracks
         self.rows: list[np.ndarray] = []
         self.kept: list[Tracks] = []  # for --offline alone
         self.num_frames = 0
         self.without_room = 0  # frames with more objects than there is room for
+        self.left_out = 0  # detections that could not be tracked
         self.drawn: np.ndarray | None = None  # the boxes of --box
 
     def add(self, tracks: Tracks) -> np.ndarray:
@@ -60,8 +60,7 @@ class Results:
             self.kept.append(tracks)
         self.num_frames += 1
         self.without_room += bool(tracks.full)
-        if self.num_frames == 1:
-            self.compiling = self.clock.seconds["track"]
+        self.left_out += tracks.left_out
         return rows
 
     def all_rows(self) -> np.ndarray:
@@ -74,15 +73,13 @@ class Results:
         """The content of summary.json."""
         rows, n = self.all_rows(), self.num_frames
         seconds = self.ahead.seconds | self.clock.seconds
-        # The first frame includes compiling, and is left out.
-        after = self.clock.seconds["track"] - self.compiling
-        rate = (n - 1) / after if n > 1 else 1 / self.compiling
         summary = {
             "frames": n,
             "objects": len(np.unique(rows[:, 1])),
             "frames_without_room": self.without_room,
+            "detections_left_out": self.left_out,
             "seconds": {part: round(taken, 3) for part, taken in seconds.items()},
-            "frames_per_second": round(rate, 2),
+            "frames_per_second": round(n / max(self.clock.seconds["track"], 1e-9), 2),
             "peak_memory_mb": round(peak_memory(), 1),
         }
         first = self.source.first

@@ -2,19 +2,17 @@
 
 import itertools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.vision import Detections, ObjectTracker
+from mpfjax.vision import ObjectTracker
 from mpfjax.vision.tracking.camera import CameraState
 from mpfjax.vision.tracking.gaussian import Gaussian
-from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives, Spans
+from mpfjax.vision.tracking.lives import Coasting, Duplicates, Spans
 from mpfjax.vision.tracking.scores import ScoreState, rising
-from mpfjax.vision.tracking.tracker import advanced
 
 M = 4
 
@@ -24,11 +22,11 @@ def test_a_box_is_filtered_as_by_the_kalman_filter():
     rng = np.random.default_rng(0)
     seen = np.array([30.0, 60, 3, 3.5]) + rng.normal(0, 0.05, (6, 4)) * [1, 1, 0, 0]
     error, place, velocity = 0.3, 0.02, 0.005
-    now = Gaussian.begun(jnp.asarray(seen[:1]), jnp.full((1, 4), 0.3), jnp.full((1, 4), 0.1))
-    unit, got = np.asarray(now.unit[0], float), []
+    now = Gaussian.begun(seen[:1], np.full((1, 4), 0.3), np.full((1, 4), 0.1))
+    unit, got = now.unit[0], []
     for row in seen[1:]:
-        predicted = now.predicted(jnp.full((1, 4), place), jnp.full((1, 4), velocity))
-        now, _, _ = predicted.updated(jnp.asarray(row[None]), jnp.full((1, 4), error))
+        predicted = now.predicted(np.full((1, 4), place), np.full((1, 4), velocity), unit)
+        now, _, _ = predicted.updated(row[None], np.full((1, 4), error))
         got.append(np.stack([moment[0] for moment in now]))
     for k in range(2):
         model = mpfjax.LinearGaussianModel(
@@ -47,9 +45,9 @@ def test_a_box_is_filtered_as_by_the_kalman_filter():
 
 
 def test_mixed_moments_are_those_of_the_mixture_of_both():
-    a = Gaussian(*(np.full((1, 4), x, np.float32) for x in (1.0, 2.0, 1.0, 0.5, 0.8)))
-    b = Gaussian(*(np.full((1, 4), x, np.float32) for x in (3.0, -1.0, 2.0, 0.1, 0.3)))
-    mixed = [moment[0, 0] for moment in a.mixed_with(b, jnp.full((1, 1), 0.3))]
+    a = Gaussian(*(np.full((1, 4), x) for x in (1.0, 2.0, 1.0, 0.5, 0.8)))
+    b = Gaussian(*(np.full((1, 4), x) for x in (3.0, -1.0, 2.0, 0.1, 0.3)))
+    mixed = [moment[0, 0] for moment in a.mixed_with(b, np.full((1, 1), 0.3))]
     means, shares = np.array([[1.0, 2.0], [3.0, -1.0]]), np.array([0.3, 0.7])
     within = np.array([[[1.0, 0.5], [0.5, 0.8]], [[2.0, 0.1], [0.1, 0.3]]])
     off = means - shares @ means
@@ -60,19 +58,15 @@ def test_mixed_moments_are_those_of_the_mixture_of_both():
 # --- noises --------------------------------------------------------------------------------
 
 TRACKER = ObjectTracker(M, frames_per_second=25)
-FOLLOW = jax.jit(lambda xs: jax.lax.scan(lambda s, x: advanced(TRACKER, s, x), TRACKER.init(), xs))
 
 
 def followed(boxes_of_frames):
     """The state after these boxes by their centres, one for each object in each frame."""
-    boxes = np.asarray(boxes_of_frames, np.float32)
-    shape, ones = boxes.shape[:2], jnp.ones(boxes.shape[:2])
-    far = jnp.tile(jnp.array([-1e6, -1e6, 1e6, 1e6]), (len(boxes), 1))
-    rows = jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32), shape)
-    labels = jnp.zeros(shape, jnp.int32)
-    found = Detections(jnp.asarray(boxes[0]), ones[0] > 0, ones[0], rows[0], far[0], labels[0])
-    leaves = jnp.asarray(boxes), ones > 0, ones, rows, far, labels
-    return FOLLOW(jax.tree.unflatten(jax.tree.structure(found), leaves))[0]
+    state = TRACKER.init()
+    for boxes in np.asarray(boxes_of_frames):
+        corners = np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, 2:]], axis=1)
+        state, _ = TRACKER.step(None, state, None, corners)
+    return state
 
 
 @pytest.mark.parametrize("error", [0.012, 0.04, 0.12])
@@ -111,39 +105,30 @@ def test_the_mean_product_of_innovations_is_the_cameras_variance(sigma, num_obje
     """Objects err on their own by half a box, which must not be taken for the camera's motion."""
     rng = np.random.default_rng(0)
     places = np.c_[100.0 * np.arange(num_objects), np.zeros((num_objects, 3))]
-    rows = jnp.asarray(places, jnp.float32)
-    small = jnp.full_like(rows, 0.02)
-    predicted = Gaussian(rows, 0 * rows, small, small, small)
-    cost = jnp.where(jnp.eye(num_objects, dtype=bool), -1.0, 1.0)
-    camera = jax.tree.map(jnp.asarray, CameraState.initial())
-    known, gone = jnp.asarray(False), jnp.zeros((1, 2))
-    step = jax.jit(
-        lambda camera, seen: camera.after(
-            predicted, gone, known, cost, jnp.full(4, 0.1), seen, jnp.ones(2)
-        )
-    )
-    kept = []
+    small = np.full_like(places, 0.02)
+    predicted = Gaussian(places, 0 * places, small, small, small)
+    cost = np.where(np.eye(num_objects, dtype=bool), -1.0, 1.0)
+    camera, gone, kept = CameraState.initial(), np.zeros((1, 2)), []
     for _ in range(600):
         gaps = rng.normal(0, sigma, 2) + rng.normal(0, 0.1, (num_objects, 2))
-        camera, _ = step(camera, jnp.asarray(places + np.pad(gaps, [(0, 0), (0, 2)]), jnp.float32))
-        kept.append(np.asarray(camera.deviations) ** 2)
+        seen = places + np.pad(gaps, [(0, 0), (0, 2)])
+        camera, _ = camera.after(predicted, gone, False, cost, np.full(4, 0.1), seen, np.ones(2))
+        kept.append(camera.deviations**2)
     # The mean of a few hundred products, of which a thirtieth is forgotten in each frame.
     learned = np.sqrt(np.mean(kept[200:]))
     assert learned == pytest.approx(sigma, rel=0.35 if sigma > 0.1 else 1.2)
 
 
 def test_a_shift_of_all_is_the_cameras_and_that_of_one_is_its_own():
-    rows = jnp.asarray(np.c_[100.0 * np.arange(5), np.zeros((5, 3))], jnp.float32)
-    small = jnp.full_like(rows, 1e-4)
+    rows = np.c_[100.0 * np.arange(5), np.zeros((5, 3))]
+    small = np.full_like(rows, 1e-4)
     predicted = Gaussian(rows, 0 * rows, small, small, small)
-    cost = jnp.where(jnp.eye(5, dtype=bool), -1.0, 1.0)
-    camera = CameraState(jnp.full(2, 0.5), jnp.full(2, 0.5), jnp.asarray(30.0))
-    seen = rows + jnp.array([[0.7, 0, 0, 0]])
-    seen = seen.at[2, 1].add(3.0)
-    known = jnp.asarray(False)
-    _, shift = camera.after(
-        predicted, jnp.zeros((1, 2)), known, cost, jnp.zeros(4), seen, jnp.ones(2)
-    )
+    cost = np.where(np.eye(5, dtype=bool), -1.0, 1.0)
+    camera = CameraState(np.full(2, 0.5), np.full(2, 0.5), 30.0)
+    seen = rows + np.array([0.7, 0, 0, 0])
+    seen[2, 1] += 3.0
+    gone = np.zeros((1, 2))
+    _, shift = camera.after(predicted, gone, False, cost, np.zeros(4), seen, np.ones(2))
     np.testing.assert_allclose(shift, [0.7, 0.0], atol=0.02)
 
 
@@ -153,7 +138,6 @@ def test_a_shift_of_all_is_the_cameras_and_that_of_one_is_its_own():
 def test_rising_is_the_nearest_sequence_that_does_not_fall():
     """Against all ways to cut five numbers into blocks of equal values."""
     rng = np.random.default_rng(0)
-    fit = jax.jit(rising)
     for _ in range(10):
         values, weights = rng.normal(size=5), rng.uniform(0.5, 2, 5)
         best = None
@@ -163,29 +147,17 @@ def test_rising_is_the_nearest_sequence_that_does_not_fall():
             loss = np.sum(weights * (values - means) ** 2)
             if (np.diff(means) >= -1e-12).all() and (best is None or loss < best[0]):
                 best = loss, means
-        np.testing.assert_allclose(
-            fit(jnp.float32(values), jnp.float32(weights)), best[1], atol=1e-5
-        )
-
-
-@jax.jit
-def after_all(frames, lasting):
-    stronger, overlaps = jnp.zeros((4, 4), bool), jnp.zeros((4, 4))
-
-    def step(state, found):
-        return state.after(found, stronger, overlaps, jnp.zeros((1, 2)), lasting), None
-
-    start = jax.tree.map(jnp.asarray, ScoreState.initial(8))
-    return jax.lax.scan(step, start, frames)[0]
+        np.testing.assert_allclose(rising(values, weights), best[1], atol=1e-9)
 
 
 def scored(frames, lasting=50):
-    """The state after frames of (places of boxes of 10 x 10, scores)."""
-    found = []
+    """The state after frames of (places of boxes of 10 x 10, scores), the strongest first."""
+    state = ScoreState.initial()
     for places, scores in frames:
-        corners = np.array([[*place, 10, 10] for place in places], float)
-        found.append(Detections.from_boxes(corners, 4, np.asarray(scores, float)))
-    return after_all(jax.tree.map(lambda *leaves: np.stack(leaves), *found), jnp.int32(lasting))
+        boxes = np.array([[*place, 10, 10] for place in places], float)
+        apart = np.eye(len(boxes))
+        state = state.after(boxes, np.asarray(scores, float), apart, state.boxes, 1.0, lasting)
+    return state
 
 
 def test_scores_of_chains_that_become_sure_are_strong_and_of_those_that_end_are_not():
@@ -209,42 +181,37 @@ def test_equal_scores_are_all_strong(score):
 
 def test_predictions_are_shown_for_as_long_as_they_were_right():
     """At 25 frames a second: a tenth of one before anything is known."""
-    spans = Spans.at(jnp.asarray(25.0))
-    coasting = jax.tree.map(jnp.asarray, Coasting.initial())
-    assert int(coasting.longest(spans)) == 2
-    lives = jax.tree.map(jnp.asarray, Lives.initial(3))
-    gone = lives._replace(unseen=jnp.array([10, 10, 10]), confirmed=jnp.ones(3, bool))
-    now = gone._replace(identities=jnp.array([1, 2, 3], jnp.int32))
-    seen, after = jnp.ones(3, bool), jax.jit(Coasting.after)
+    spans, coasting, ten = Spans.at(25.0), Coasting.initial(), np.full(3, 10.0)
+    assert coasting.longest(spans) == 2
+    all_three, none = np.ones(3, bool), np.zeros(3, bool)
+    right = wrong = coasting
     for _ in range(20):
-        right = after(coasting, gone, now, seen, seen, spans)
-        wrong = after(coasting, gone, now, seen, ~seen, spans)
-        assert int(right.longest(spans)) >= 5
-        assert int(wrong.longest(spans)) == 0
-    nobody = gone._replace(identities=jnp.zeros(3, jnp.int32))
-    ended = after(coasting, gone, nobody, ~seen, seen, spans)
-    assert float(jnp.sum(ended.wrong)) == 3 * 11
+        right = right.after(ten, all_three, none, spans)
+        wrong = wrong.after(ten, none, all_three, spans)
+        assert right.longest(spans) >= 5
+        assert wrong.longest(spans) == 0
+    ended = coasting.after(ten + 1, none, all_three, spans)
+    assert ended.wrong.sum() == 3 * 11
     assert not ended.wrong[9:].any()  # of 20 bins for 25 frames
 
 
 def test_who_never_leaves_a_neighbour_before_it_ends_is_a_double():
     """Others that began beside an older one decide: most of them ended there, or went away."""
-    together = jnp.array([[1.0, 0.4], [0.4, 1.0]])
-    apart, seen = jnp.eye(2), jnp.ones(2, bool)
-    after = jax.jit(Duplicates.after)
+    together, seen = np.array([[1.0, 0.4], [0.4, 1.0]]), np.ones(2, bool)
 
     def many(overlaps_before_the_end, ends):
-        duplicates = jax.tree.map(jnp.asarray, Duplicates.initial(2))
+        duplicates, lives_on = Duplicates.initial(), np.zeros(0, bool)
         for name in range(2, 14):
-            names = jnp.array([1, name], jnp.int32)
-            duplicates = after(duplicates, names, jnp.array([name > 2, False]), seen, together)
-            assert np.asarray(duplicates.elders).tolist() == [0, 1]
+            names = np.array([1, name])
+            duplicates = duplicates.after(names, lives_on, seen, together)
+            assert duplicates.elders.tolist() == [0, 1]
             begun = duplicates
-            duplicates = after(duplicates, names, seen, seen, overlaps_before_the_end)
+            duplicates = duplicates.after(names, seen, seen, overlaps_before_the_end)
             if ends:
-                gone = jnp.array([1, 0], jnp.int32)
-                duplicates = after(duplicates, gone, jnp.array([True, False]), seen, together)
+                lone = np.array([True, False])
+                duplicates = duplicates.after(names[:1], lone, seen[:1], together[:1, :1])
+                lives_on = seen[:1]
         return begun
 
-    assert np.asarray(many(together, ends=True).doubtful).tolist() == [False, True]
-    assert not np.asarray(many(apart, ends=True).doubtful).any()
+    assert many(together, ends=True).doubtful.tolist() == [False, True]
+    assert not many(np.eye(2), ends=True).doubtful.any()

@@ -3,11 +3,10 @@
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.vision import Detections, ObjectTracker, track
+from mpfjax.vision import ObjectTracker, track
 from mpfjax.vision.tracking.gaussian import CameraMotion, Gaussian
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
 
@@ -129,7 +128,7 @@ def test_moments_are_carried_by_the_matrix_of_the_similarity():
     a, b, shift = 1.02, 0.3, np.array([4.0, -7.0])
     known = np.asarray(True)
     motion = CameraMotion(np.float32([a, b]), shift.astype(np.float32), known)
-    got = motion.carried(Gaussian(*map(jnp.asarray, parts)))
+    got = motion.carried(Gaussian(*parts))
     matrix = np.array([[a, -b], [b, a]])
     np.testing.assert_allclose(got.place[:, :2], parts[0][:, :2] @ matrix.T + shift, rtol=1e-5)
     np.testing.assert_allclose(
@@ -142,9 +141,7 @@ def test_moments_are_carried_by_the_matrix_of_the_similarity():
             np.testing.assert_allclose(after[i, :2], np.diag(turned), rtol=1e-5)
         np.testing.assert_array_equal(after[:, 2:], before[:, 2:])
     unknown = motion._replace(known=np.asarray(False))
-    for before, after in zip(
-        parts, unknown.carried(Gaussian(*map(jnp.asarray, parts))), strict=True
-    ):
+    for before, after in zip(parts, unknown.carried(Gaussian(*parts)), strict=True):
         np.testing.assert_array_equal(after, before)
 
 
@@ -194,11 +191,10 @@ def test_wrong_motions_from_pixels_are_overruled_by_the_detections():
     boxes = shaken(1)[1][0]
     rng = np.random.default_rng(2)
     state = TRACKER.init()
-    rows = Detections.from_boxes(boxes, 12)
     for number in range(40):
         jump = np.float32([rng.choice([-5, 5]), 0])
         wrong = CameraMotion(np.float32([1, 0]), jump, np.asarray(True))
-        state, tracks = TRACKER.step(jax.random.key(number), state, None, rows, wrong)
+        state, tracks = TRACKER.step(jax.random.key(number), state, None, boxes, wrong)
     assert sorted(np.asarray(tracks.identities)[np.asarray(tracks.confirmed)]) == [1, 2, 3, 4]
     assert distances(tracks, boxes).max() < 1.0
     assert float(state.camera.left[0]) > 0.03  # of boxes 30 pixels wide

@@ -3,13 +3,11 @@
 import itertools
 import threading
 
-import equinox as eqx
-import jax
 import numpy as np
 import pytest
 from PIL import Image
 
-from mpfjax.vision import Detections, ObjectTracker, Tracks, track
+from mpfjax.vision import ObjectTracker, Tracks, track
 from mpfjax.vision.boxes.following import follow_boxes
 from mpfjax.vision.tracking.track import offline_rows, online_rows
 
@@ -139,8 +137,9 @@ def test_weak_detections_are_left_out_where_a_least_score_is_given():
 @pytest.mark.parametrize(
     ("message", "what"),
     [
-        (r"boxes of no area", [10.0, 10, 5, -5]),
-        (r"frame 1 has boxes outside the frame, 64 x 48", [10.0, -30, 5, 30]),
+        (r"frame 1, row 0, .* of no area", [10.0, 10, 5, -5]),
+        (r"frame 1, row 0, .* not finite", [10.0, np.nan, 5, 5]),
+        (r"frame 1, row 0, .* outside the frame", [10.0, -30, 5, 30]),
     ],
 )
 def test_what_cannot_be_tracked_is_left_out_with_one_warning(message, what, with_pixels):
@@ -148,7 +147,8 @@ def test_what_cannot_be_tracked_is_left_out_with_one_warning(message, what, with
     with pytest.warns(RuntimeWarning, match=message) as caught:
         run = tracked(stills(), np.concatenate([bad, walks()]))
     assert len(caught) == 1
-    assert_same(run, with_pixels, same_rows=False)
+    assert [tracks.left_out for tracks in run] == [1] * NUM_FRAMES
+    assert_same([tracks._replace(left_out=0) for tracks in run], with_pixels, same_rows=False)
 
 
 def test_two_thousand_detections_leave_the_strongest():
@@ -209,6 +209,15 @@ def test_a_damaged_frame_is_predicted_and_later_ones_keep_their_numbers():
     ]
 
 
+def test_a_frame_that_a_mapping_has_not_is_one_without_a_detector():
+    """As None in the place of boxes is."""
+    frames = list(by_frame(walks()))
+    some = {number: found for number, found in enumerate(frames, 1) if number not in (4, 6)}
+    listed = [some.get(number) for number in range(1, NUM_FRAMES + 1)]
+    assert_same(tracked(None, some), tracked(None, listed))
+    assert all(tracks.shown.sum() == 2 for tracks in tracked(None, some))
+
+
 # --- which detection is whose ---------------------------------------------------------------------
 
 
@@ -219,7 +228,7 @@ def test_tracks_say_which_row_each_object_took_whatever_the_order_and_what_is_le
     frames = [
         np.array([*rows[rows[:, 0] == t + 1, 2:6], flat])[order[t]] for t in range(NUM_FRAMES)
     ]
-    with pytest.warns(RuntimeWarning, match="boxes of no area"):
+    with pytest.warns(RuntimeWarning, match="frame 1, row ., .* of no area"):
         found = tracked(None, frames)
     labels = [
         {int(tracks.identities[m]): order[t][tracks.detections[m]] for m in range(2)}
@@ -255,18 +264,6 @@ def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_
     offline = offline_rows(kept, 5)
     assert offline[:, :2].tolist() == [[5, 1], [6, 1]]
     assert offline_rows([]).shape == (0, 6)
-
-
-def test_the_second_frame_is_tracked_by_the_program_of_the_first():
-    """A number of another kind in the state would compile all of it anew."""
-    before, found = TRACKER.init(), Detections.from_boxes(np.ones((1, 4)), 6)
-    after, _ = eqx.filter_eval_shape(TRACKER.step, jax.random.key(0), before, None, found)
-    kinds = [
-        jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type), state)
-        for state in (before, after)
-    ]
-    assert jax.tree.leaves(kinds[0]) == jax.tree.leaves(kinds[1])
-    assert jax.tree.structure(before) == jax.tree.structure(after)
 
 
 @pytest.mark.exactness

@@ -1,10 +1,12 @@
 """The bins into which a colour histogram sorts pixels."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, UInt8
+import numpy as np
+from jaxtyping import Float, Int, UInt8
 
 from mpfjax.checks import Checked, Count, Share
 
@@ -27,7 +29,7 @@ class AbstractColours(Checked):
         """Bins a channel."""
 
     @abc.abstractmethod
-    def bins(self, frame: UInt8[Array, "h w 3"]) -> Int[Array, "h w channels"]:
+    def bins(self, frame: UInt8[Any, "h w 3"]) -> Int[Any, "h w channels"]:
         """The bin of each pixel in each channel, in [0, num_bins)."""
 
 
@@ -44,7 +46,7 @@ class RGBColours(AbstractColours):
         """3."""
         return 3
 
-    def bins(self, frame: UInt8[Array, "h w 3"]) -> Int[Array, "h w 3"]:
+    def bins(self, frame: UInt8[Any, "h w 3"]) -> Int[Any, "h w 3"]:
         """Red, green and blue in steps of 256 / num_bins."""
         return frame.astype(jnp.int32) * self.num_bins // 256
 
@@ -77,37 +79,40 @@ class HSVColours(AbstractColours):
         """N = N_h N_s + N_v."""
         return self.num_hues * self.num_saturations + self.num_values
 
-    def bins(self, frame: UInt8[Array, "h w 3"]) -> Int[Array, "h w 1"]:
+    def bins(self, frame: UInt8[Any, "h w 3"]) -> Int[Any, "h w 1"]:
         """Hue N_s + saturation where there is colour, N_h N_s + value where there is not."""
         hue, saturation, value = hue_saturation_value(frame)
         coloured = (saturation >= self.least_saturation) & (value >= self.least_value)
         colour = _bin(hue, self.num_hues) * self.num_saturations
         colour += _bin(saturation, self.num_saturations)
         grey = self.num_hues * self.num_saturations + _bin(value, self.num_values)
-        return jnp.where(coloured, colour, grey)[:, :, None]
+        xp: Any = np if isinstance(frame, np.ndarray) else jnp
+        return xp.where(coloured, colour, grey)[:, :, None]
 
 
 def hue_saturation_value(
-    frame: UInt8[Array, "h w 3"],
-) -> tuple[Float[Array, "h w"], Float[Array, "h w"], Float[Array, "h w"]]:
+    frame: UInt8[Any, "h w 3"],
+) -> tuple[Float[Any, "h w"], Float[Any, "h w"], Float[Any, "h w"]]:
     """Hue, saturation and value of each pixel in [0, 1], by the usual hexcone.
 
     Hue runs from red at 0 through green at 1/3 and blue at 2/3; it is 0 where there is no colour.
+    By NumPy where the frame is an array of it, without compiling anything.
     """
-    red, green, blue = (frame[:, :, i].astype(jnp.float32) for i in range(3))
-    high = jnp.maximum(jnp.maximum(red, green), blue)
-    chroma = high - jnp.minimum(jnp.minimum(red, green), blue)
-    unit = jnp.where(chroma > 0, chroma, 1.0)
+    xp: Any = np if isinstance(frame, np.ndarray) else jnp
+    red, green, blue = (frame[:, :, i].astype(xp.float32) for i in range(3))
+    high = xp.maximum(xp.maximum(red, green), blue)
+    chroma = high - xp.minimum(xp.minimum(red, green), blue)
+    unit = xp.where(chroma > 0, chroma, 1.0)
     from_red = (green - blue) / unit
-    sector = jnp.where(
+    sector = xp.where(
         high == red,
-        jnp.where(from_red < 0, from_red + 6, from_red),
-        jnp.where(high == green, (blue - red) / unit + 2, (red - green) / unit + 4),
+        xp.where(from_red < 0, from_red + 6, from_red),
+        xp.where(high == green, (blue - red) / unit + 2, (red - green) / unit + 4),
     )
-    hue = jnp.where(chroma > 0, sector / 6, 0.0)
-    saturation = chroma / jnp.where(high > 0, high, 1.0)
+    hue = xp.where(chroma > 0, sector / 6, 0.0)
+    saturation = chroma / xp.where(high > 0, high, 1.0)
     return hue, saturation, high / 255
 
 
-def _bin(share: Float[Array, "h w"], num_bins: int) -> Int[Array, "h w"]:
-    return jnp.minimum((share * num_bins).astype(jnp.int32), num_bins - 1)
+def _bin(share: Float[Any, "h w"], num_bins: int) -> Int[Any, "h w"]:
+    return (share * num_bins).astype(jnp.int32).clip(0, num_bins - 1)

@@ -2,13 +2,11 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Float, Int
 
 from mpfjax.vision.tracking.associate import argmax_pairs, mahalanobis
-from mpfjax.vision.tracking.gaussian import Gaussian, zeros
+from mpfjax.vision.tracking.gaussian import Gaussian
 
 _FREEDOM = 4.0  # degrees, of Student's distribution of what objects do on their own
 _ROUNDS = 5
@@ -26,26 +24,25 @@ class CameraState(NamedTuple):
     - `weight`: how many frames of many objects they are the means of.
     """
 
-    deviations: Float[Array, "2"]
-    left: Float[Array, "2"]
-    weight: Float[Array, ""]
+    deviations: Float[np.ndarray, "2"]
+    left: Float[np.ndarray, "2"]
+    weight: float
 
     @classmethod
     def initial(cls) -> "CameraState":
         """A camera that is nearly still."""
-        still = zeros(2) + np.float32(_STILL)
-        return cls(still, still, zeros() + np.float32(_PRIOR))
+        return cls(np.full(2, _STILL), np.full(2, _STILL), _PRIOR)
 
     def after(
         self,
         predicted: Gaussian,
-        gone: Float[Array, "#m 2"],
-        known: Bool[Array, ""],
-        cost: Float[Array, "m d"],
-        errors: Float[Array, "4"],
-        places: Float[Array, "d 4"],
-        box: Float[Array, "2"],
-    ) -> tuple["CameraState", Float[Array, "2"]]:
+        gone: Float[np.ndarray, "#m 2"],
+        known: bool,
+        cost: Float[np.ndarray, "m d"],
+        errors: Float[np.ndarray, "4"],
+        places: Float[np.ndarray, "d 4"],
+        box: Float[np.ndarray, "2"],
+    ) -> tuple["CameraState", Float[np.ndarray, "2"]]:
         """The shift that all objects have in common, and the deviations after it.
 
         A camera that shakes or turns shifts all objects at once. An object and a detection form a
@@ -60,36 +57,31 @@ class CameraState(NamedTuple):
         is by how much a jolt, or the motion from pixels, has moved each object: where the latter is
         `known`, c is what is left.
         """
-        partner = argmax_pairs(jnp.maximum(-cost, 0.0))
-        paired = (partner >= 0)[:, None]
-        gaps = places[jnp.maximum(partner, 0), :2] - predicted.place[:, :2]
-        gaps = jnp.where(paired, gaps, 0.0)
-        variances = (predicted.var_place + (predicted.unit * errors[None]) ** 2)[:, :2]
-        deviations = jnp.where(known, self.left, self.deviations)
-        prior = (deviations * box) ** 2
-
-        def improve(_: Int[Array, ""], shift: Float[Array, "2"]) -> Float[Array, "2"]:
-            trust = (_FREEDOM + 1) / (_FREEDOM * variances + (gaps - shift[None]) ** 2)
-            trust = jnp.where(paired, trust, 0.0)
-            return jnp.sum(trust * gaps, axis=0) / (jnp.sum(trust, axis=0) + 1 / prior)
-
-        shift = jax.lax.fori_loop(0, _ROUNDS, improve, jnp.zeros_like(prior))
-        n = jnp.sum(paired, dtype=gaps.dtype)
-        told = jnp.maximum(n - 1, 0.0) / (n + 3)  # two objects tell less than many
-        weight = jnp.minimum(self.weight + told, 1 / _RATE)
-        all_of_it = jnp.where(paired, gaps + gone, 0.0)
-        deviations = _learned(self.deviations, all_of_it / box[None], n, told / weight)
-        left = jnp.where(known, _learned(self.left, gaps / box[None], n, told / weight), self.left)
+        partner = argmax_pairs(np.maximum(-cost, 0.0))
+        rows = np.flatnonzero(partner >= 0)
+        gaps = places[partner[rows], :2] - predicted.place[rows, :2]
+        variances = (predicted.var_place + (predicted.unit * errors) ** 2)[rows, :2]
+        prior = ((self.left if known else self.deviations) * box) ** 2
+        shift = np.zeros(2)
+        for _ in range(_ROUNDS):
+            trust = (_FREEDOM + 1) / (_FREEDOM * variances + (gaps - shift) ** 2)
+            shift = np.sum(trust * gaps, axis=0) / (np.sum(trust, axis=0) + 1 / prior)
+        n = len(rows)
+        told = max(n - 1, 0) / (n + 3)  # two objects tell less than many
+        weight = min(self.weight + told, 1 / _RATE)
+        all_of_it = (gaps + np.broadcast_to(gone, (len(partner), 2))[rows]) / box
+        deviations = _learned(self.deviations, all_of_it, told / weight)
+        left = _learned(self.left, gaps / box, told / weight) if known else self.left
         return CameraState(deviations, left, weight), shift
 
 
 def jolted(
     predicted: Gaussian,
-    errors: Float[Array, "4"],
-    places: Float[Array, "d 4"],
-    unlike: Float[Array, "m d"],
-    seen: Int[Array, " m"],
-) -> Float[Array, "2"]:
+    errors: Float[np.ndarray, "4"],
+    places: Float[np.ndarray, "d 4"],
+    unlike: Float[np.ndarray, "m d"],
+    seen: Int[np.ndarray, " m"],
+) -> Float[np.ndarray, "2"]:
     """The shift of a jolt that leaves most objects without a detection, zero if there was none.
 
     `unlike` is infinite where the two are no pair, and `seen` is 0 for what was not seen lately.
@@ -98,34 +90,33 @@ def jolted(
     same. The one that explains most counts, if that is three quarters of them, and two more than
     without it.
     """
-    number = jnp.sum(seen > 0, dtype=jnp.int32)
+    rows = np.flatnonzero(seen)
+    rows = rows[np.argsort(-seen[rows], kind="stable")]
+    objects, unlike = predicted.at(rows), unlike[rows]
 
-    def explained(shift: Float[Array, "2"]) -> Int[Array, ""]:
-        cost = mahalanobis(predicted.shifted(shift), errors, places) + unlike
-        near = jnp.any(cost < 0, axis=1) & (seen > 0)
-        return jnp.sum(near, dtype=jnp.int32)
+    def explained(shift: np.ndarray) -> int:
+        cost = mahalanobis(objects.shifted(shift), errors, places) + unlike
+        return int((cost < 0).any(axis=1).sum())
 
-    def tried() -> Float[Array, "2"]:
-        leaders = jax.lax.top_k(seen, min(_LEADERS, len(seen)))[1]
-        gaps = places[None, :, :2] - predicted.place[leaders, None, :2]
-        far = jnp.sum((gaps / predicted.unit[leaders, None, :2]) ** 2, axis=2) + unlike[leaders]
-        nearest = jax.lax.top_k(-far, min(_NEAREST, len(places)))[1]
-        shifts = jnp.take_along_axis(gaps, nearest[..., None], axis=1).reshape(-1, 2)
-        numbers = jax.vmap(explained)(shifts)
-        best = jnp.argmax(numbers)
-        found = (numbers[best] > still + 1) & (4 * numbers[best] >= 3 * number)
-        return jnp.where(found, shifts[best], 0.0)
-
-    zero = jnp.zeros(2, places.dtype)
-    still = explained(zero)
-    return jax.lax.cond(2 * still <= number, tried, lambda: zero)
+    still = explained(np.zeros(2))
+    if 2 * still > len(rows) or len(rows) < still + 2:
+        return np.zeros(2)
+    leaders = slice(_LEADERS)
+    gaps = places[None, :, :2] - objects.place[leaders, None, :2]
+    far = np.sum((gaps / objects.unit[leaders, None, :2]) ** 2, axis=2) + unlike[leaders]
+    nearest = np.argsort(far, axis=1, kind="stable")[:, :_NEAREST]
+    shifts = np.take_along_axis(gaps, nearest[..., None], axis=1).reshape(-1, 2)
+    numbers = np.array([explained(shift) for shift in shifts])
+    best = int(np.argmax(numbers)) if len(numbers) else 0
+    told = len(numbers) and numbers[best] > still + 1 and 4 * numbers[best] >= 3 * len(rows)
+    return shifts[best] if told else np.zeros(2)
 
 
 def _learned(
-    deviations: Float[Array, "2"], gaps: Float[Array, "m 2"], n: Array, rate: Array
-) -> Float[Array, "2"]:
+    deviations: Float[np.ndarray, "2"], gaps: Float[np.ndarray, "n 2"], rate: float
+) -> Float[np.ndarray, "2"]:
     """The deviations after a frame with n innovations, in boxes."""
-    products = jnp.sum(gaps, axis=0) ** 2 - jnp.sum(gaps**2, axis=0)
-    products = jnp.clip(products / jnp.maximum(n * (n - 1), 1.0), -(_MOST**2), _MOST**2)
-    squares = (1 - rate) * deviations**2 + rate * products
-    return jnp.sqrt(jnp.clip(squares, _LEAST**2, _MOST**2))
+    n = len(gaps)
+    products = np.sum(gaps, axis=0) ** 2 - np.sum(gaps**2, axis=0)
+    products = np.clip(products / max(n * (n - 1), 1), -(_MOST**2), _MOST**2)
+    return np.sqrt(np.clip((1 - rate) * deviations**2 + rate * products, _LEAST**2, _MOST**2))

@@ -1,18 +1,12 @@
 """Boxes as four independent coordinates, and Gaussian moments of their places and velocities."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 # The share of a size's growth rate that is left after a frame.
 _GROWTH_KEPT = 0.9
-
-
-def zeros(*shape: int, dtype: Any = np.float32) -> Any:
-    """By NumPy: each operation of JAX would be a program of its own before the first frame."""
-    return np.zeros(shape, dtype)
 
 
 class Gaussian(NamedTuple):
@@ -22,55 +16,58 @@ class Gaussian(NamedTuple):
     - `var_place`, `cov`, `var_velocity`: the entries of the covariance of place and velocity.
     """
 
-    place: Float[Array, "*n 4"]
-    velocity: Float[Array, "*n 4"]
-    var_place: Float[Array, "*n 4"]
-    cov: Float[Array, "*n 4"]
-    var_velocity: Float[Array, "*n 4"]
+    place: Float[np.ndarray, "*n 4"]
+    velocity: Float[np.ndarray, "*n 4"]
+    var_place: Float[np.ndarray, "*n 4"]
+    cov: Float[np.ndarray, "*n 4"]
+    var_velocity: Float[np.ndarray, "*n 4"]
 
     @classmethod
-    def nowhere(cls, *shape: int) -> "Gaussian":
-        """Boxes of one pixel about the origin, to fill empty rows."""
-        zero = zeros(*shape, 4)
-        return cls(zero, zero, zero, zero, zero)
+    def none(cls, *shape: int) -> "Gaussian":
+        """Of no object: rows of this shape."""
+        return cls(*(np.zeros((0, *shape, 4)) for _ in cls._fields))
 
     @classmethod
     def begun(
         cls,
-        place: Float[Array, "*#n #4"],
-        error: Float[Array, "*#n #4"],
-        speed: Float[Array, "*#n #4"],
+        place: Float[np.ndarray, "*#n #4"],
+        error: Float[np.ndarray, "*#n #4"],
+        speed: Float[np.ndarray, "*#n #4"],
     ) -> "Gaussian":
         """At a first detection: the deviation of its error, and that of a velocity of mean zero."""
-        still = jnp.zeros_like(error * speed)
+        still = 0.0 * error * speed
         return cls(place + still, still, error**2 + still, still, speed**2 + still)
 
     @property
-    def unit(self) -> Float[Array, "*n 4"]:
+    def unit(self) -> Float[np.ndarray, "*n 4"]:
         """The units of length along each coordinate, by the mean box."""
         return units(self.place)
 
     def predicted(
-        self, place_noise: Float[Array, "*#n #4"], velocity_noise: Float[Array, "*#n #4"]
+        self,
+        place_noise: Float[np.ndarray, "*#n #4"],
+        velocity_noise: Float[np.ndarray, "*#n #4"],
+        unit: Float[np.ndarray, "*#n #4"],
+        frames: float = 1.0,
     ) -> "Gaussian":
-        """The moments a frame later: x += v + noise, v += noise; growth rates of sizes decay, in
-        the mean.
+        """The moments so many frames later; growth rates of sizes decay, in the mean.
 
-        Deviations of the noises are in boxes.
+        In a frame x += v + noise and v += noise, with deviations in units of length.
         """
-        kept = _along_last(np.array([1, 1, _GROWTH_KEPT, _GROWTH_KEPT], np.float32), self.place)
-        unit = self.unit
+        kept = np.array([1, 1, *[_GROWTH_KEPT**frames] * 2])
+        reach = np.array([frames, frames, *[(1 - kept[2]) / (1 - _GROWTH_KEPT)] * 2])
         return Gaussian(
-            self.place + self.velocity,
+            self.place + reach * self.velocity,
             kept * self.velocity,
-            self.var_place + 2 * self.cov + self.var_velocity + (unit * place_noise) ** 2,
-            self.cov + self.var_velocity,
-            self.var_velocity + (unit * velocity_noise) ** 2,
+            self.var_place
+            + frames * (2 * self.cov + frames * self.var_velocity + (unit * place_noise) ** 2),
+            self.cov + frames * self.var_velocity,
+            self.var_velocity + frames * (unit * velocity_noise) ** 2,
         )
 
     def updated(
-        self, detected: Float[Array, "*#n #4"], errors: Float[Array, "*#n #4"]
-    ) -> tuple["Gaussian", Float[Array, "*n 4"], Float[Array, "*n 4"]]:
+        self, detected: Float[np.ndarray, "*#n #4"], errors: Float[np.ndarray, "*#n #4"]
+    ) -> tuple["Gaussian", Float[np.ndarray, "*n 4"], Float[np.ndarray, "*n 4"]]:
         """Kalman's update by a detection: the posterior, the innovations and their variances."""
         variance = self.var_place + errors**2
         gap = detected - self.place
@@ -80,11 +77,11 @@ class Gaussian(NamedTuple):
             self.velocity + gain_velocity * gap,
             self.var_place * (1 - gain),
             self.cov * (1 - gain),
-            jnp.maximum(self.var_velocity - gain_velocity * self.cov, 0.0),
+            (self.var_velocity - gain_velocity * self.cov).clip(0.0),
         )
         return posterior, gap, variance
 
-    def mixed_with(self, other: "Gaussian", share: Float[Array, "*n #4"]) -> "Gaussian":
+    def mixed_with(self, other: "Gaussian", share: Float[np.ndarray, "*n #4"]) -> "Gaussian":
         """The moments of a mixture of this Gaussian, with weight `share`, and the other."""
         away, away_velocity = self.place - other.place, self.velocity - other.velocity
         means = (share * a + (1 - share) * b for a, b in zip(self, other, strict=True))
@@ -95,15 +92,22 @@ class Gaussian(NamedTuple):
             var_velocity=mixed.var_velocity + between * away_velocity**2,
         )
 
-    def shifted(self, shift: Float[Array, "2"]) -> "Gaussian":
+    def shifted(self, shift: Float[np.ndarray, "2"]) -> "Gaussian":
         """The moments of what has been moved by (x, y)."""
-        return self._replace(place=self.place + _along_last(jnp.pad(shift, (0, 2)), self.place))
+        return self._replace(place=self.place + np.append(shift, [0, 0]))
 
-    def where(self, chosen: Bool[Array, "*n"], other: "Gaussian") -> "Gaussian":
-        """These moments in the chosen rows, and the other's elsewhere."""
-        shape = chosen.shape + (1,) * (self.place.ndim - chosen.ndim)
-        rows = chosen.reshape(shape)
-        return Gaussian(*(jnp.where(rows, a, b) for a, b in zip(self, other, strict=True)))
+    def at(self, rows: np.ndarray) -> "Gaussian":
+        """The moments of some rows."""
+        return Gaussian(*(moment[rows] for moment in self))
+
+    def put(self, rows: np.ndarray, other: "Gaussian") -> None:
+        """Write those of others into some rows, in place."""
+        for moment, its in zip(self, other, strict=True):
+            moment[rows] = its
+
+    def joined(self, other: "Gaussian") -> "Gaussian":
+        """The rows of both, one after the other."""
+        return Gaussian(*map(np.concatenate, zip(self, other, strict=True)))
 
 
 class CameraMotion(NamedTuple):
@@ -115,14 +119,19 @@ class CameraMotion(NamedTuple):
     - `known`: whether it was found; if not, the others mean nothing.
     """
 
-    turn: Float[Array | np.ndarray, "2"]
-    shift: Float[Array | np.ndarray, "2"]
-    known: Bool[Array | np.ndarray, ""]
+    turn: Float[np.ndarray, "2"]
+    shift: Float[np.ndarray, "2"]
+    known: Bool[np.ndarray, ""] | bool
 
     @classmethod
     def unknown(cls) -> "CameraMotion":
         """No motion was found."""
-        return cls(np.array([1, 0], np.float32), np.zeros(2, np.float32), np.asarray(False))
+        return cls(np.array([1.0, 0.0]), np.zeros(2), False)
+
+    def moved(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Where points are that stand still; as they are where the motion is unknown."""
+        (a, b), shift = self.turn, self.shift
+        return points @ np.array([[a, b], [-b, a]]) + shift if self.known else points
 
     def carried(self, moments: Gaussian) -> Gaussian:
         """The moments of what moves with the picture; as they are where the motion is unknown.
@@ -130,60 +139,60 @@ class CameraMotion(NamedTuple):
         Means of places and velocities turn, sizes grow by the scale. Covariances along x and y are
         those of the turned ones without what couples the two.
         """
-        a, b = jnp.where(self.known, self.turn, np.array([1.0, 0.0], np.float32))
-        growth = 0.5 * jnp.log(a**2 + b**2)
-        added = jnp.where(self.known, jnp.append(self.shift, jnp.stack([growth, growth])), 0.0)
+        if not self.known:
+            return moments
+        a, b = np.asarray(self.turn, float).tolist()
+        growth = 0.5 * np.log(a**2 + b**2)
 
-        def turned(rows: Float[Array, "*n 4"], a: Array, b: Array, c: Array) -> Array:
+        def turned(rows: np.ndarray, a: float, b: float, c: float) -> np.ndarray:
             x, y = rows[..., :1], rows[..., 1:2]
-            return jnp.concatenate([a * x + b * y, c * x + a * y, rows[..., 2:]], axis=-1)
+            return np.concatenate([a * x + b * y, c * x + a * y, rows[..., 2:]], axis=-1)
 
         place, velocity, *spread = moments
-        means = turned(place, a, -b, b) + _along_last(added, place), turned(velocity, a, -b, b)
-        return Gaussian(*means, *(turned(rows, a**2, b**2, b**2) for rows in spread))
+        place = turned(place, a, -b, b) + np.append(self.shift, [growth, growth])
+        spread = (turned(rows, a**2, b**2, b**2) for rows in spread)
+        return Gaussian(place, turned(velocity, a, -b, b), *spread)
 
 
-def _along_last(values: Any, rows: Array) -> Any:
-    """Values with as many axes as rows have."""
-    return values.reshape((1,) * (rows.ndim - 1) + (-1,))
-
-
-def boxes_of(places: Float[Array, "*m 4"]) -> Float[Array, "*m 4"]:
+def boxes_of(places: Float[np.ndarray, "*m 4"]) -> Float[np.ndarray, "*m 4"]:
     """Centre and size in pixels, of places (x, y, log w, log h)."""
-    return jnp.concatenate([places[..., :2], jnp.exp(places[..., 2:])], axis=-1)
+    return np.concatenate([places[..., :2], np.exp(places[..., 2:])], axis=-1)
 
 
-def places_of(boxes: Float[Array, "*m 4"]) -> Float[Array, "*m 4"]:
+def places_of(boxes: Float[np.ndarray, "*m 4"]) -> Float[np.ndarray, "*m 4"]:
     """(x, y, log w, log h) of boxes by centre and size."""
-    return jnp.concatenate([boxes[..., :2], jnp.log(boxes[..., 2:])], axis=-1)
+    return np.concatenate([boxes[..., :2], np.log(boxes[..., 2:])], axis=-1)
 
 
-def units(places: Float[Array, "*m 4"]) -> Float[Array, "*m 4"]:
+def units(places: Float[np.ndarray, "*m 4"]) -> Float[np.ndarray, "*m 4"]:
     """The units of length along each coordinate: (w, h, 1, 1)."""
-    sizes = jnp.exp(places[..., 2:])
-    return jnp.concatenate([sizes, jnp.ones_like(sizes)], axis=-1)
+    sizes = np.exp(places[..., 2:])
+    return np.concatenate([sizes, np.ones_like(sizes)], axis=-1)
 
 
-def overlap(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d"]:
-    """Intersection over union of every box with every other, 0 where one has no area."""
+def overlap(a: Float[np.ndarray, "m 4"], b: Float[np.ndarray, "d 4"]) -> Float[np.ndarray, "m d"]:
+    """Intersection over union of every box with every other."""
     return shared(a[:, None], b[None])
 
 
-def shared(a: Float[Array, "*#n 4"], b: Float[Array, "*#n 4"]) -> Float[Array, "*n"]:
-    """Intersection over union of boxes, pair by pair, 0 where one has no area."""
-    low = jnp.maximum(a[..., :2] - a[..., 2:] / 2, b[..., :2] - b[..., 2:] / 2)
-    high = jnp.minimum(a[..., :2] + a[..., 2:] / 2, b[..., :2] + b[..., 2:] / 2)
-    common = jnp.prod(jnp.maximum(high - low, 0.0), axis=-1)
-    union = jnp.prod(a[..., 2:], axis=-1) + jnp.prod(b[..., 2:], axis=-1) - common
-    return jnp.where(union > 0, common / jnp.where(union > 0, union, 1.0), 0.0)
+def shared(a: Float[np.ndarray, "*#n 4"], b: Float[np.ndarray, "*#n 4"]) -> np.ndarray:
+    """Intersection over union of boxes by centre and size, pair by pair."""
+    # Coordinate by coordinate: arrays of pairs, and no larger ones.
+    x, y = (
+        np.minimum(a[..., k] + a[..., k + 2] / 2, b[..., k] + b[..., k + 2] / 2)
+        - np.maximum(a[..., k] - a[..., k + 2] / 2, b[..., k] - b[..., k + 2] / 2)
+        for k in range(2)
+    )
+    common = np.maximum(x, 0.0) * np.maximum(y, 0.0)
+    return common / (a[..., 2] * a[..., 3] + b[..., 2] * b[..., 3] - common)
 
 
 def within(
-    boxes: Float[Array, "k 4"],
-    extent: Float[Array, "4"],
-    centred: Bool[Array, " k"] | bool = False,
-) -> Bool[Array, " k"]:
+    boxes: Float[np.ndarray, "k 4"],
+    extent: Float[np.ndarray, "4"],
+    centred: Bool[np.ndarray, " k"] | bool = False,
+) -> Bool[np.ndarray, " k"]:
     """Whether any part of each box, or its centre, is inside left, top, right and bottom."""
-    half = jnp.where(jnp.reshape(jnp.asarray(centred), (-1, 1)), 0.0, boxes[:, 2:] / 2)
+    half = np.where(np.reshape(centred, (-1, 1)), 0.0, boxes[:, 2:] / 2)
     low, high = boxes[:, :2] - half, boxes[:, :2] + half
-    return jnp.all((high >= extent[None, :2]) & (low <= extent[None, 2:]), axis=1)
+    return np.all((high >= extent[:2]) & (low <= extent[2:]), axis=1)

@@ -1,28 +1,27 @@
 """The detector's errors and the noises of the motion, learned from the recording itself."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+from scipy.special import softmax
 
-from mpfjax.vision.tracking.gaussian import Gaussian, units, zeros
+from mpfjax.vision.tracking.gaussian import Gaussian, units
 
 # Candidate deviations of detections, places and velocities, in boxes, wider than real ones.
 _ERRORS = (0.01, 0.02, 0.04, 0.08, 0.16)
 _PLACES = (0.005, 0.015, 0.045)
 _VELOCITIES = (0.001, 0.005, 0.025, 0.1)
-_GRID = np.array([(r, q, v) for r in _ERRORS for q in _PLACES for v in _VELOCITIES], np.float32)
+_GRID = np.array([(r, q, v) for r in _ERRORS for q in _PLACES for v in _VELOCITIES])
 _RIVALS = _GRID.T[:, None, :, None]  # for all objects and coordinates
 # Means of the log-normal priors along (x, y, log w, log h), and their standard deviations.
 _PRIOR = np.array(
-    [(0.03, 0.03, 0.04, 0.04), (0.02, 0.015, 0.03, 0.02), (0.01, 0.006, 0.003, 0.003)], np.float32
+    [(0.03, 0.03, 0.04, 0.04), (0.02, 0.015, 0.03, 0.02), (0.01, 0.006, 0.003, 0.003)]
 )
 _LOG_GRID, _LOG_PRIOR = np.log(_RIVALS[:, 0]), np.log(_PRIOR)[:, None]
-_DOUBTS = np.array([0.7, 0.7, 0.9], np.float32)
+_DOUBTS = np.array([0.7, 0.7, 0.9])
 # The deviation of a newborn object's velocity at 25 frames a second, and at most times as large.
-_SPEED, _MOST = np.array([0.1, 0.05, 0.05, 0.03], np.float32), 2.5
+_SPEED, _MOST = np.array([0.1, 0.05, 0.05, 0.03]), 2.5
 # The prior of newborn speeds counts as so many objects; of so many later ones, one is forgotten.
 _NEWBORN, _LATEST = 4.0, 50.0
 _MEMORY = 20.0  # frames after which evidence is forgotten
@@ -37,10 +36,10 @@ class Noises(NamedTuple):
     - `speed`: of an object's velocity at its first detection.
     """
 
-    errors: Float[Array, "4"]
-    place: Float[Array, "4"]
-    velocity: Float[Array, "4"]
-    speed: Float[Array, "4"]
+    errors: Float[np.ndarray, "4"]
+    place: Float[np.ndarray, "4"]
+    velocity: Float[np.ndarray, "4"]
+    speed: Float[np.ndarray, "4"]
 
 
 class NoiseState(NamedTuple):
@@ -54,31 +53,34 @@ class NoiseState(NamedTuple):
     """
 
     moments: Gaussian
-    evidence: Float[Array, "l 4"]
-    squares: Float[Array, "4"]
-    newborn: Float[Array, ""]
-    start: Float[Array, "4"]
+    evidence: Float[np.ndarray, "l 4"]
+    squares: Float[np.ndarray, "4"]
+    newborn: float
+    start: Float[np.ndarray, "4"]
     noises: Noises
 
     @classmethod
-    def initial(cls, num_objects: int, frames_per_second: float) -> "NoiseState":
+    def initial(cls, frames_per_second: float) -> "NoiseState":
         """Before any frame: the means of the priors. New objects move further at a lower rate."""
-        start: Any = np.float32(min(25 / frames_per_second, _MOST)) * _SPEED
-        errors, place, velocity = (zeros(4) + row for row in _PRIOR)
-        noises = Noises(errors, place, velocity, start)
-        moments, evidence = Gaussian.nowhere(num_objects, len(_GRID)), zeros(len(_GRID), 4)
-        return cls(moments, evidence, zeros(4), zeros(), start, noises)
+        start = min(25 / frames_per_second, _MOST) * _SPEED
+        moments, evidence = Gaussian.none(len(_GRID)), np.zeros((len(_GRID), 4))
+        return cls(moments, evidence, np.zeros(4), 0.0, start, Noises(*_PRIOR, speed=start))
+
+    def predicted(self, unit: Float[np.ndarray, "m 4"], frames: float) -> "NoiseState":
+        """Every object under every candidate, later; the units are the objects'."""
+        _, place, velocity = _RIVALS
+        moments = self.moments.predicted(place, velocity, unit[:, None], frames)
+        return self._replace(moments=moments)
 
     def after(
         self,
-        places: Float[Array, "m 4"],
-        detected: Bool[Array, " m"],
-        teaches: Bool[Array, " m"],
-        born: Bool[Array, " m"],
-        grown: Bool[Array, " m"],
-        objects: Gaussian,
+        rows: np.ndarray,
+        unit: Float[np.ndarray, "k 4"],
+        places: Float[np.ndarray, "k 4"],
+        teaches: Bool[np.ndarray, " k"],
+        grown: Gaussian,
     ) -> "NoiseState":
-        """Filter every object under every candidate, and update the evidence.
+        """Update the objects in these rows by their detections, and the evidence.
 
         Under each candidate a Kalman filter follows each object. The predictive density of the
         object's next detection, Student's since innovations have heavy tails, adds to the evidence
@@ -87,38 +89,34 @@ class NoiseState(NamedTuple):
         Magill (1965), with one model for all objects. The speed of newborn objects is the scale of
         Student's distribution of the velocities of those that have `grown`.
 
-        `places` are those of the objects' detections. `self.moments` have moved with the camera.
+        `self.moments` are predicted, have moved with the camera, and are written to.
         """
-        errors, place_noise, velocity_noise = jnp.asarray(_RIVALS)
-        moments = self.moments.predicted(place_noise, velocity_noise)
-        unit = moments.unit
-        posterior, gap, variance = moments.updated(places[:, None], unit * errors)
-        tails = 0.5 * (_FREEDOM + 1) * jnp.log1p(gap**2 / variance / _FREEDOM)
-        density = -tails - 0.5 * jnp.log(variance / unit**2)
-        density = jnp.sum(jnp.where(teaches[:, None, None], density, 0.0), axis=0)
+        unit = unit[:, None]
+        posterior, gap, variance = self.moments.at(rows).updated(places[:, None], unit * _RIVALS[0])
+        self.moments.put(rows, posterior)
+        gap, variance, unit = gap[teaches], variance[teaches], unit[teaches]
+        tails = 0.5 * (_FREEDOM + 1) * np.log1p(gap**2 / variance / _FREEDOM)
+        density = np.sum(-tails - 0.5 * np.log(variance / unit**2), axis=0)
         # Successive innovations of an object are correlated, unlike under the model.
-        evidence = np.float32(np.exp(-1 / _MEMORY)) * self.evidence + 0.5 * density
-        unit = units(places)[:, None]
-        begun = Gaussian.begun(places[:, None], unit * errors, unit * self.noises.speed[None, None])
-        moments = begun.where(born, posterior.where(detected, moments))
-        squares, newborn = self._speeds(grown, objects)
-        speed = jnp.sqrt((_NEWBORN * self.start**2 + squares) / (_NEWBORN + newborn))
+        evidence = np.exp(-1 / _MEMORY) * self.evidence + 0.5 * density
+        squares, newborn = self._speeds(grown)
+        speed = np.sqrt((_NEWBORN * self.start**2 + squares) / (_NEWBORN + newborn))
         log_prior = -0.5 * np.sum(((_LOG_GRID - _LOG_PRIOR) / _DOUBTS[:, None, None]) ** 2, axis=0)
-        believed = jax.nn.softmax(evidence + log_prior, axis=0)
-        errors, place, velocity = jnp.exp(jnp.sum(believed[None] * _LOG_GRID, axis=1))
-        noises = Noises(errors, place, velocity, speed)
-        return NoiseState(moments, evidence, squares, newborn, self.start, noises)
+        believed = softmax(evidence + log_prior, axis=0)
+        noises = Noises(*np.exp(np.sum(believed[None] * _LOG_GRID, axis=1)), speed=speed)
+        return NoiseState(self.moments, evidence, squares, newborn, self.start, noises)
 
-    def _speeds(
-        self, grown: Bool[Array, " m"], objects: Gaussian
-    ) -> tuple[Float[Array, "4"], Float[Array, ""]]:
+    def begun(self, places: Float[np.ndarray, "k 4"], speed: Float[np.ndarray, "4"]) -> Gaussian:
+        """New objects under every candidate."""
+        unit = units(places)[:, None]
+        return Gaussian.begun(places[:, None], unit * _RIVALS[0], unit * speed)
+
+    def _speeds(self, grown: Gaussian) -> tuple[Float[np.ndarray, "4"], float]:
         """The sum of squared velocities of newborn objects and their number, with this frame's.
 
         The sum is weighted by a step of expectation maximisation for Student's scale.
         """
-        squares = (objects.velocity**2 + objects.var_velocity) / objects.unit**2
-        trust = (_FREEDOM + 1) / (_FREEDOM + squares / self.noises.speed[None] ** 2)
-        number = jnp.sum(grown, dtype=squares.dtype)
-        kept = (1 - 1 / _LATEST) ** number
-        total = jnp.sum(jnp.where(grown[:, None], trust * squares, 0.0), axis=0)
-        return kept * self.squares + total, kept * self.newborn + number
+        squares = (grown.velocity**2 + grown.var_velocity) / grown.unit**2
+        trust = (_FREEDOM + 1) / (_FREEDOM + squares / self.noises.speed**2)
+        kept, number = (1 - 1 / _LATEST) ** len(squares), len(squares)
+        return kept * self.squares + np.sum(trust * squares, axis=0), kept * self.newborn + number

@@ -2,77 +2,66 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import isotonic_regression
+from scipy.special import expit, logit
 
-from mpfjax.vision.tracking.associate import argmax_pairs, seated
-from mpfjax.vision.tracking.detections import Detections
-from mpfjax.vision.tracking.gaussian import overlap, zeros
+from mpfjax.vision.tracking.associate import argmax_pairs
+from mpfjax.vision.tracking.gaussian import overlap
 
 _REMEMBERED = 512
 _HIGH = 0.9  # the quantile of the scores that is called a sure score
 _BINS = 10  # of shares of a sure detection's score
-_CENTRES = (np.arange(_BINS, dtype=np.float32) + np.float32(0.5)) / _BINS
+_CENTRES = (np.arange(_BINS) + 0.5) / _BINS
 _SURE = 0.9  # a chain that reaches this share is an object
 STRONG, WEAK = 0.5, 0.2  # the shares that are strong before anything is learned, and that count
 _SLOPE = 0.15  # the prior odds are logistic in the share, of this scale
 PRIOR = 5.0  # detections that the prior of each bin counts as
 KEPT = 0.995  # kept from each frame to the next
 _SAME, _DUPLICATE = 0.3, 0.6  # least overlap of boxes in a chain, and of a box with its duplicate
-_GONE = 2  # longest gap in a chain, in frames
+_GONE = 2  # longest gap in a chain, in frames with detections
 
 
 class ScoreState(NamedTuple):
     """The scores so far, chains of detections that overlap from frame to frame, and their fates.
 
-    - `recent`: (512,), the latest scores; `count`: how many there were in all.
+    - `recent`: the latest scores, at most 512.
     - `weak`, `strong`: the least score that counts, and from which on a detection is strong.
-    - `boxes`: (c, 4), the last box of each chain; `unseen`: frames since its last detection.
+    - `boxes`: (c, 4), the last box of each living chain, moved with the camera; `unseen`: frames
+      with detections since its last one.
     - `age`: frames since its first detection, which counts as one; `sure`: whether it has proved to
       be an object; `pending`: (c, bins), its detections by share while that is not decided.
     - `good`, `bad`: (bins,), detections of chains that proved to be objects, and of chains that
       ended before.
     """
 
-    recent: Float[Array, " k"]
-    count: Int[Array, ""]
-    weak: Float[Array, ""]
-    strong: Float[Array, ""]
-    boxes: Float[Array, "c 4"]
-    unseen: Int[Array, " c"]
-    age: Int[Array, " c"]
-    sure: Bool[Array, " c"]
-    pending: Float[Array, "c bins"]
-    good: Float[Array, " bins"]
-    bad: Float[Array, " bins"]
+    recent: Float[np.ndarray, " k"]
+    weak: float
+    strong: float
+    boxes: Float[np.ndarray, "c 4"]
+    unseen: Int[np.ndarray, " c"]
+    age: Float[np.ndarray, " c"]
+    sure: Bool[np.ndarray, " c"]
+    pending: Float[np.ndarray, "c bins"]
+    good: Float[np.ndarray, " bins"]
+    bad: Float[np.ndarray, " bins"]
 
     @classmethod
-    def initial(cls, num_chains: int) -> "ScoreState":
+    def initial(cls) -> "ScoreState":
         """No score seen yet, and no chain."""
-        none = zeros(num_chains, dtype=np.int32)
-        return cls(
-            recent=zeros(_REMEMBERED),
-            count=zeros(dtype=np.int32),
-            weak=zeros(),
-            strong=zeros(),
-            boxes=zeros(num_chains, 4),
-            unseen=none + _GONE,
-            age=none,
-            sure=none > 0,
-            pending=zeros(num_chains, _BINS),
-            good=zeros(_BINS),
-            bad=zeros(_BINS),
-        )
+        none, bins = np.zeros(0, int), np.zeros(_BINS)
+        chains = np.zeros((0, 4)), none, 0.0 * none, none > 0, np.zeros((0, _BINS))
+        return cls(np.zeros(0), 0.0, 0.0, *chains, bins, bins)
 
     def after(
         self,
-        found: Detections,
-        stronger: Bool[Array, "d d"],
-        overlaps: Float[Array, "d d"],
-        shift: Float[Array, "#c 2"],
-        lasting: Int[Array, ""],
+        boxes: Float[np.ndarray, "d 4"],
+        scores: Float[np.ndarray, " d"],
+        overlaps: Float[np.ndarray, "d d"],
+        moved: Float[np.ndarray, "c 4"],
+        frames: float,
+        lasting: float,
     ) -> "ScoreState":
         """Remember the frame's scores, continue the chains, and set the thresholds.
 
@@ -87,93 +76,71 @@ class ScoreState(NamedTuple):
             (g + n p) / (g + b + n),  n = 5
 
         made non-decreasing in the score by isotonic regression. Detections are strong from 1/2 on.
-        Counts lose four tenths in a hundred frames. Chains move with the camera, by `shift`.
+        Counts lose four tenths in a hundred frames. The chains' boxes have `moved` with the camera.
+        Detections come strongest first, so many `frames` after those before.
         """
-        # The oldest are overwritten; rows that are no detection are written nowhere.
-        place = (self.count + jnp.cumsum(found.valid, dtype=jnp.int32) - 1) % _REMEMBERED
-        place = jnp.where(found.valid, place, _REMEMBERED)
-        recent = self.recent.at[place].set(found.scores, mode="drop")
-        count = self.count + jnp.sum(found.valid, dtype=jnp.int32)
-        known = jnp.arange(_REMEMBERED, dtype=jnp.int32) < count
-        number = jnp.maximum(jnp.minimum(count, _REMEMBERED), 1)
-        rank = jnp.ceil(_HIGH * (number - 1).astype(recent.dtype)).astype(jnp.int32)
-        sure = jnp.sort(jnp.where(known, recent, jnp.inf))[rank]
-        lowest = jnp.minimum(jnp.min(jnp.where(known, recent, jnp.inf)), 0.0)
+        recent = np.concatenate([self.recent, scores])[-_REMEMBERED:]
+        sure = np.sort(recent)[int(np.ceil(_HIGH * (len(recent) - 1)))] if len(recent) else 0.0
+        lowest = recent.min(initial=0.0)
         spread = sure - lowest
-        shares = (found.scores - lowest) / jnp.where(spread > 0, spread, 1.0)
-        shares = jnp.where(spread > 0, shares, 1.0)
-        duplicates = (overlaps > _DUPLICATE) & stronger & found.valid[:, None]
-        single = found.valid & ~jnp.any(duplicates, axis=0)
-        state = self._continued(found.boxes, single, stronger, shift, shares, lasting)
+        shares = (scores - lowest) / spread if spread > 0 else np.ones_like(scores)
+        single = ~(np.triu(overlaps, 1) > _DUPLICATE).any(axis=0)
+        state = self._continued(boxes[single], moved, shares[single], frames, lasting)
         strong = lowest + state.strong_share() * spread
         # Where all scores are equal, rounding must not put them below the threshold.
-        weak = jnp.where(count > 0, jnp.minimum(lowest + WEAK * spread, strong), -jnp.inf)
-        return state._replace(recent=recent, count=count, weak=weak, strong=strong)
+        weak = min(lowest + WEAK * spread, strong) if len(recent) else -np.inf
+        return state._replace(recent=recent, weak=weak, strong=strong)
 
     def _continued(
         self,
-        found: Float[Array, "d 4"],
-        single: Bool[Array, " d"],
-        stronger: Bool[Array, "d d"],
-        shift: Float[Array, "#c 2"],
-        shares: Float[Array, " d"],
-        lasting: Array,
+        found: Float[np.ndarray, "d 4"],
+        moved: Float[np.ndarray, "c 4"],
+        shares: Float[np.ndarray, " d"],
+        frames: float,
+        lasting: float,
     ) -> "ScoreState":
         """The chains after a frame whose detections have these shares of a sure score."""
-        moved = self.boxes + jnp.pad(shift, ((0, 0), (0, 2)))
-        living = (self.unseen < _GONE)[:, None] & single[None]
-        overlaps = jnp.maximum(overlap(self.boxes, found), overlap(moved, found))
-        overlaps = jnp.where(living, overlaps, 0.0)
-        rows = argmax_pairs(jnp.where(overlaps > _SAME, overlaps, 0.0))
-        taken = jnp.where(rows >= 0, rows, len(single))
-        new = single & ~jnp.zeros_like(single).at[taken].set(True, mode="drop")
-        begun = seated(new, stronger, self.unseen >= _GONE)
-        begins = begun >= 0
-        rows = jnp.maximum(rows, begun)
-        seen, own = rows >= 0, shares[jnp.maximum(rows, 0)]
-        bins = jnp.clip((own * _BINS).astype(jnp.int32), 0, _BINS - 1)
-        pending = self.pending + jnp.where(
-            seen[:, None], jax.nn.one_hot(bins, _BINS, dtype=self.pending.dtype), 0.0
-        )
-        age = jnp.where(begins, 1, self.age + 1)
+        overlaps = np.maximum(overlap(self.boxes, found), overlap(moved, found))
+        rows = argmax_pairs(np.where(overlaps > _SAME, overlaps, 0.0))
+        seen, free = rows >= 0, np.ones(len(found), bool)
+        free[rows[seen]] = False
+        new = np.flatnonzero(free)
+        # New chains come after the others.
+        rows, seen = np.append(rows, new), np.append(seen, new >= 0)
+        none = np.zeros(len(new), int)
+        boxes = np.concatenate([moved, found[new]])
+        boxes[seen] = found[rows[seen]]
+        pending = np.concatenate([self.pending, np.zeros((len(new), _BINS))])
+        own = np.where(seen, np.append(shares, 0.0)[rows], 0.0)
+        bins = np.clip((own * _BINS).astype(int), 0, _BINS - 1)
+        pending[seen, bins[seen]] += 1
+        age = np.append(self.age + frames, none + 1)
         proved = seen & ((own >= _SURE) | (age >= lasting))
-        sure = (self.sure & ~begins) | proved
-        unseen = jnp.where(seen, 0, jnp.minimum(self.unseen + 1, _GONE))
-        ended = (unseen >= _GONE) & ~sure
+        sure = np.append(self.sure, none > 0) | proved
+        unseen = np.where(seen, 0, np.append(self.unseen, none) + 1)
+        ended = unseen >= _GONE
+        good, bad = pending[sure].sum(axis=0), pending[ended & ~sure].sum(axis=0)
+        chains = boxes, unseen, age, sure, np.where(sure[:, None], 0.0, pending)
+        boxes, unseen, age, sure, pending = (rows[~ended] for rows in chains)
         return self._replace(
-            boxes=jnp.where(seen[:, None], found[jnp.maximum(rows, 0)], moved),
-            unseen=unseen,
-            age=age,
-            sure=sure,
-            pending=jnp.where((sure | ended)[:, None], 0.0, pending),
-            good=KEPT * self.good + jnp.sum(jnp.where(sure[:, None], pending, 0.0), axis=0),
-            bad=KEPT * self.bad + jnp.sum(jnp.where(ended[:, None], pending, 0.0), axis=0),
-        )
+            boxes=boxes, unseen=unseen, age=age, sure=sure, pending=pending,
+            good=KEPT * self.good + good, bad=KEPT * self.bad + bad,
+        )  # fmt: skip
 
-    def strong_share(self) -> Float[Array, ""]:
+    def strong_share(self) -> float:
         """The share above which a detection is more probably an object than none."""
-        prior = jax.nn.sigmoid((_CENTRES - STRONG) / _SLOPE)
+        prior = expit((_CENTRES - STRONG) / _SLOPE)
         number = self.good + self.bad + PRIOR
-        odds = jax.scipy.special.logit(rising((self.good + PRIOR * prior) / number, number))
-        above = jnp.argmax(odds >= 0)
-        below = jnp.maximum(above - 1, 0)
-        step = odds[above] - odds[below]
-        part = jnp.where(step > 0, -odds[below] / jnp.where(step > 0, step, 1.0), 0.0)
-        centres = jnp.asarray(_CENTRES)
-        share = centres[below] + part * (centres[above] - centres[below])
-        share = jnp.where(odds[0] >= 0, 0.0, share)
-        return jnp.where(odds[-1] >= 0, jnp.minimum(share, _SURE), _SURE)
+        odds = logit(rising((self.good + PRIOR * prior) / number, number))
+        above = int(np.argmax(odds >= 0))
+        if odds[-1] < 0:
+            return _SURE
+        if above == 0:
+            return 0.0
+        part = -odds[above - 1] / (odds[above] - odds[above - 1])
+        return float(min(_CENTRES[above - 1] + part / _BINS, _SURE))
 
 
-def rising(values: Float[Array, " k"], weights: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Isotonic regression: the nearest non-decreasing sequence, by weighted least squares.
-
-    By its min-max formula (Barlow et al. 1972): entry i is the maximum over a ≤ i of the minimum
-    over b ≥ i of the weighted mean of entries a to b.
-    """
-    sums, totals = jnp.cumsum(weights * values), jnp.cumsum(weights)
-    begin, end = np.arange(len(values))[:, None], np.arange(len(values))[None]
-    number = totals[None] - (totals - weights)[:, None]
-    means = (sums[None] - (sums - weights * values)[:, None]) / jnp.where(end >= begin, number, 1.0)
-    lowest = jax.lax.cummin(jnp.where(end >= begin, means, jnp.inf), axis=1, reverse=True)
-    return jnp.max(jnp.where(end >= begin, lowest, -jnp.inf), axis=0)
+def rising(values: Float[np.ndarray, " k"], weights: Float[np.ndarray, " k"]) -> np.ndarray:
+    """Isotonic regression: the nearest non-decreasing sequence, by weighted least squares."""
+    return isotonic_regression(values, weights=weights).x

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.tracking.camera import CameraState
 from mpfjax.vision.tracking.gaussian import Gaussian
 from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives
@@ -13,13 +14,20 @@ from mpfjax.vision.tracking.scores import ScoreState
 
 
 class TrackerState(NamedTuple):
-    """All that an `ObjectTracker` remembers, in arrays with a row for each of M objects.
+    """All that an `ObjectTracker` remembers, with a row for each object.
 
     - `objects`: the moments of place and velocity, (m, 4) each.
     - `lives`, `coasting`, `duplicates`: identities and counts; how long predictions are right;
       which are a second box of another one.
     - `scores`, `camera`, `noise`: what has been learned of the detector, the camera and the motion.
     - `colours`: (m, bins), the histograms of each object, all zero where it has none.
+    - `last_identity`: the highest ever given.
+    - `full`: whether there was no room for a new object in the last frame.
+    - `begun`: whether there was a frame on which the detector ran; `waited`: for how many frames it
+      has not run since.
+    - `time`: in seconds, of the last frame; None where nobody said it.
+    - `number`: how many frames there were; `left_out`: (3,), how many detections could not be
+      tracked, by `FAULTS`.
     """
 
     objects: Gaussian
@@ -29,14 +37,21 @@ class TrackerState(NamedTuple):
     scores: ScoreState
     camera: CameraState
     noise: NoiseState
-    colours: Float[Array, "m bins"]
+    colours: Float[np.ndarray, "m bins"]
+    last_identity: int
+    full: bool
+    begun: bool
+    waited: float
+    time: float | None
+    number: int
+    left_out: Int[np.ndarray, "3"]
 
 
 class Tracks(NamedTuple):
-    """The tracks in one frame, a row for each of M objects.
+    """The tracks in one frame, a row for each object.
 
     - `boxes`: (m, 4), the mean box of each, centre and size in pixels.
-    - `identities`: (m,), a number that an object keeps for life, 0 in an empty row.
+    - `identities`: (m,), a number that an object keeps for life.
     - `confirmed`: (m,), whether it has had enough detections to be taken for an object.
     - `unseen`: (m,), frames since its last detection.
     - `full`: whether a detection that would have started an object found no room.
@@ -46,20 +61,21 @@ class Tracks(NamedTuple):
       detector gave; -1 for none. Use it to look up masks and features.
     - `probabilities`: (m,), that this detection is the object's own; 0 where there is none.
     - `classes`: (m,), the class of each, the first that its detections had; 0 for none.
+    - `left_out`: how many detections of this frame could not be tracked.
     """
 
-    boxes: Float[Array, "m 4"]
-    identities: Int[Array, " m"]
-    confirmed: Bool[Array, " m"]
-    unseen: Int[Array, " m"]
-    full: Bool[Array, ""]
-    shown: Bool[Array, " m"]
-    detections: Int[Array, " m"]
-    probabilities: Float[Array, " m"]
-    classes: Int[Array, " m"]
+    boxes: Float[Array | np.ndarray, "m 4"]
+    identities: Int[Array | np.ndarray, " m"]
+    confirmed: Bool[Array | np.ndarray, " m"]
+    unseen: Float[Array | np.ndarray, " m"]
+    full: Bool[Array, ""] | bool
+    shown: Bool[Array | np.ndarray, " m"]
+    detections: Int[Array | np.ndarray, " m"]
+    probabilities: Float[Array | np.ndarray, " m"]
+    classes: Int[Array | np.ndarray, " m"]
+    left_out: Int[np.ndarray, ""] | int = 0
 
     @property
-    def corner_boxes(self) -> Float[Array | np.ndarray, "m 4"]:
+    def corner_boxes(self) -> Float[np.ndarray, "m 4"]:
         """The boxes (x, y, w, h) with (x, y) the top-left corner, as files have them."""
-        sides = self.boxes[:, np.array([2, 3, 2, 3])]
-        return self.boxes - sides * np.array([[0.5, 0.5, 0, 0]], self.boxes.dtype)
+        return top_left(np.asarray(self.boxes))

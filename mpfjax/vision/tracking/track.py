@@ -5,31 +5,19 @@ from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import Count, Finite, checked, one_of
-from mpfjax.operations.compiling import in_little_memory, jit_with
-from mpfjax.vision.files.boxes import centred, top_left
+from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.files.frames import of_one_kind, read_frames
 from mpfjax.vision.files.threads import read_ahead
-from mpfjax.vision.tracking.adapters import (
-    LEAST_ROOM,
-    Once,
-    Rows,
-    Sieve,
-    as_detector,
-    observed,
-)
-from mpfjax.vision.tracking.detections import DetectedBoxes, Detections
+from mpfjax.vision.tracking.adapters import LEAST_ROOM, Once, Rows, as_detector, observed
+from mpfjax.vision.tracking.detections import Detections, Found
 from mpfjax.vision.tracking.gaussian import CameraMotion
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
 from mpfjax.vision.tracking.state import Tracks
-from mpfjax.vision.tracking.tracker import ObjectTracker, advanced, colours_of
-
-# Compiling in four fifths of the time is worth a tenth of a frame's up to here.
-_FEW_OBJECTS = 48
+from mpfjax.vision.tracking.tracker import ObjectTracker, advanced, coloured
 
 
 @checked
@@ -54,15 +42,17 @@ def track(
         track(frames, lambda frame: network(frame))        # boxes, scores and classes
         track(frames, read_detections("det.txt"))          # rows of a MOTChallenge file
         track(frames, BackgroundSubtraction().detect)      # what moves before a still camera
-        track(None, rows)                                  # without pixels, for speed or radar
+        track(None, rows)                                  # without pixels, for speed
 
     - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable, or the
       path of a video or of a folder of images, from frame `first` on; None where there are only
       detections. A frame that is None, as `read_frames` has it for a damaged one, is predicted.
     - `detections`: a function from a frame to its boxes (x, y, w, h), top-left corner first, in
       pixels, or to a tuple of boxes and scores (None for none), or of boxes, scores and classes;
-      or an iterable of these, one item for each frame; or an array of rows (frame, id, x, y, w, h,
-      score) whose frames count from 1, or the path of a MOTChallenge file of these.
+      or an iterable of these, one item for each frame, or a mapping from the numbers of frames to
+      them; or an array of rows (frame, id, x, y, w, h, score) whose frames count from 1, or the
+      path of a MOTChallenge file of these. None in the place of boxes, and a frame that a mapping
+      has not, says that the detector did not run, which is not "nothing there".
     - `tracker`: None takes `ObjectTracker()`, with more room where a frame has more rows.
     - `key`: counts for nothing, since nothing is drawn.
     - `first`: the number of the first frame, by which rows are found.
@@ -79,10 +69,10 @@ def track(
       the tracks; `close()`, or the last track, ends the thread. Use it for recordings, which then
       take less time; a camera's tracks would be late.
 
-    The tracks of each frame are NumPy arrays. Without pixels coordinates may be large, as those of
-    maps are. Rows of a masked array with a masked entry are no detections. Boxes without area or
-    outside the frame are left out with a warning, as are detections in frames after the last.
-    Another warning is given where there are more detections or objects than there is room for.
+    Coordinates may be large, as those of maps are. Rows of a masked array with a masked entry are
+    no detections. Boxes that are not finite, have no area or lie outside the frame are left out;
+    the first of each kind is warned of, and `Tracks.left_out` counts them. There are warnings for
+    detections in frames after the last, and for more detections or objects than there is room for.
     Raises `ValueError` with the name of the argument for values that cannot be used, at the frame
     in which they come, and `ImportError` for "pixels" without OpenCV. An exception of the detector
     is passed on, with the number of the frame. Use it for recorded videos and for cameras.
@@ -90,7 +80,7 @@ def track(
     if isinstance(frames, str | Path):
         frames = read_frames(frames, first)
     del key
-    detector, sieve = as_detector(detections), Sieve(min_score, frame_size)
+    detector = as_detector(detections)
     if frames is None and (callable(detector) or camera_motion == "pixels"):
         raise ValueError("frames: None; a detector, and camera_motion 'pixels', need them")
     if tracker is None:
@@ -102,72 +92,65 @@ def track(
         camera_motion = "pixels"
     flow = OpticalFlow() if camera_motion == "pixels" else None
     found = observed(stills, detector, first)
-    return _tracked(_seen(found, sieve, tracker, room, use_colours, flow), tracker, ahead)
+    seen = _seen(found, frame_size, min_score, room, use_colours, flow)
+    return _tracked(seen, tracker, ahead)
 
 
 class _Seen(NamedTuple):
-    """All that a step takes of a frame, and the places of its detections in what was found."""
+    """All that a step takes of a frame."""
 
     number: int
-    pixels: Any
-    observation: Detections
+    found: Found | None
     motion: CameraMotion | None
-    kept: np.ndarray
-    origin: np.ndarray
 
 
 def _seen(
-    frames: Iterator[tuple[int, np.ndarray | None, DetectedBoxes]],
-    sieve: Sieve,
-    tracker: ObjectTracker,
+    frames: Iterator[tuple[int, np.ndarray | None, Detections | None]],
+    frame_size: tuple[int, int] | None,
+    min_score: float | None,
     room: int,
     use_colours: bool,
     flow: OpticalFlow | None,
 ) -> Iterator[_Seen]:
     """What does not depend on earlier tracks, frame by frame."""
-    once, origin = Once(), None
-    for number, still, found in frames:
-        found, kept = sieve(found, number, still)
-        if len(found.boxes) > room:
-            once.warn(
-                "detections",
-                f"detections: frame {number} has {len(found.boxes)}, more than the {room} that"
-                " there is room for, max_detections; the strongest are kept",
-            )
-        if still is not None and (use_colours or flow is not None):
-            origin = np.zeros(2)  # that of the pixels
-        elif origin is None and len(found.boxes):
-            origin = np.median(centred(found.boxes)[:, :2], axis=0)
-        corner = np.zeros(2) if origin is None else origin
-        size = sieve.frame_size if still is None else still.shape[:2]
-        observation = Detections.from_boxes(
-            found.boxes, room, found.scores, frame_size=size, origin=corner, classes=found.classes
-        )
-        pixels = colours_of(still, observation) if use_colours and still is not None else None
-        motion = None if flow is None or still is None else flow(still, found.boxes)
-        yield _Seen(number, pixels, observation, motion, kept, corner)
+    once = Once()
+    for number, still, detected in frames:
+        found, motion = None, None
+        size = frame_size if still is None else still.shape[:2]
+        if detected is not None:
+            if min_score is not None and len(detected.boxes) and detected.scores is None:
+                raise ValueError(f"min_score: {min_score}, and detections have no scores")
+            found = Found.of(detected, f"detections: frame {number}", size)
+            if min_score is not None:
+                found = found.at(found.scores >= min_score)
+            if len(found.rows) > room:
+                once.warn(
+                    "detections",
+                    f"detections: frame {number} has {len(found.rows)}, more than the {room} that"
+                    " there is room for, max_detections; the strongest are kept",
+                )
+                found = found.at(slice(room))
+            if use_colours and still is not None:
+                found = coloured(found, still)
+        if flow is not None and still is not None:
+            motion = flow(still, None if found is None else top_left(found.boxes))
+        yield _Seen(number, found, motion)
 
 
 def _tracked(
     seen: Iterator[_Seen], tracker: ObjectTracker, ahead: bool
 ) -> Generator[Tracks, None, None]:
     state, once = tracker.init(), Once()
-    advance = jit_with(in_little_memory(soon=tracker.max_objects <= _FEW_OBJECTS), advanced)
     with read_ahead(seen) if ahead else contextlib.nullcontext(seen) as coming:
-        for number, pixels, observation, motion, kept, origin in coming:
-            state, tracks = advance(tracker, state, observation, pixels, motion)
-            tracks = jax.device_get(tracks)
+        for number, found, motion in coming:
+            state, tracks = advanced(tracker, state, found, motion)
             if tracks.full:
                 once.warn(
                     "objects",
                     f"tracker: frame {number} has more objects than the {tracker.max_objects} that"
                     " there is room for, max_objects; the strongest are kept",
                 )
-            taken = tracks.detections
-            yield tracks._replace(
-                boxes=tracks.boxes + np.append(origin, [0, 0]),
-                detections=np.where(taken >= 0, np.append(kept, -1)[taken], -1),
-            )
+            yield tracks
 
 
 # --- tracks as files have them -------------------------------------------------------------
@@ -198,7 +181,7 @@ def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r
 
 def _rows(number: int, tracks: Tracks, written: Any) -> np.ndarray:
     written = np.flatnonzero(np.asarray(written) & (np.asarray(tracks.identities) > 0))
-    corners = top_left(np.asarray(tracks.boxes)[written])
+    corners = tracks.corner_boxes[written]
     ids = np.asarray(tracks.identities)[written]
     rows = np.column_stack([np.full(len(ids), number), ids, corners])
     # Rounded as in files, so that scores are the same from a file.

@@ -1,38 +1,32 @@
 """A tracker of an unknown number of objects, from detections: a Kalman filter for each."""
 
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
-from mpfjax.checks import POSITIVE, Checked, Count, as_numbers, checked
+from mpfjax.checks import Checked, Count, Finite, Positive, checked
 from mpfjax.vision.colour.bins import HSVColours
-from mpfjax.vision.colour.histograms import SampledBoxes, normalise
+from mpfjax.vision.colour.histograms import sampled_histograms
 from mpfjax.vision.tracking.associate import (
     compatible,
     learned_colours,
     mahalanobis,
     one_to_one,
     probabilities,
-    seated,
-    stronger,
     unlikeness,
 )
 from mpfjax.vision.tracking.camera import CameraState, jolted
-from mpfjax.vision.tracking.detections import DetectedBoxes, Detections
+from mpfjax.vision.tracking.detections import FAULTS, Detections, Found
 from mpfjax.vision.tracking.gaussian import (
     CameraMotion,
     Gaussian,
     boxes_of,
     overlap,
-    places_of,
     shared,
     units,
     within,
-    zeros,
 )
 from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives, Spans
 from mpfjax.vision.tracking.noise import NoiseState
@@ -48,12 +42,6 @@ _BIRTH_OVERLAP = 0.5  # with an object or a stronger detection: it is one more b
 _SAME = 0.5  # least overlap of a prediction that was right with the detection
 _CONTACT = 0.12  # an overlap from which on objects would learn each other's colours
 _FIRST = 3  # strong detections of an object after which it teaches the noises
-
-
-def _as_rate(frames_per_second: Any) -> np.ndarray:
-    """An array, so that one program serves all rates."""
-    rate = 25 if frames_per_second is None else frames_per_second
-    return np.asarray(as_numbers("frames_per_second", rate), np.float32)
 
 
 class ObjectTracker(Checked):
@@ -74,8 +62,9 @@ class ObjectTracker(Checked):
     Lengths are in boxes, so that nothing depends on the size of the frame or of the objects.
 
     - `max_objects`: M, how many objects there is room for.
-    - `frames_per_second`: of the video. An object ends after a second without a detection. None
-      takes 25.
+    - `frames_per_second`: of the video.
+    - `lost_seconds`: an object ends after so long without a detection. None takes a second, and
+      eight frames where these are longer.
     - `scores`: "rank" finds from which score on a detection is strong, and starts an object, on any
       scale. "as_given" takes scores for probabilities: strong from .5 on, and below .2 a detection
       counts for nothing. "ignore" takes all for strong.
@@ -89,28 +78,38 @@ class ObjectTracker(Checked):
     """
 
     max_objects: Count = eqx.field(static=True, default=24)
-    frames_per_second: Annotated[Float[Array | np.ndarray, ""], POSITIVE] = eqx.field(
-        converter=_as_rate, default=None, kw_only=True
-    )
+    frames_per_second: Positive | None = eqx.field(static=True, default=None, kw_only=True)
+    lost_seconds: Positive | None = eqx.field(static=True, default=None, kw_only=True)
     scores: Literal["rank", "as_given", "ignore"] = eqx.field(
         static=True, default="rank", kw_only=True
     )
     class_matters: Literal["prefers"] | bool = eqx.field(static=True, default=True, kw_only=True)
 
+    @property
+    def rate(self) -> float:
+        """Frames a second, 25 where nobody says."""
+        return 25.0 if self.frames_per_second is None else float(self.frames_per_second)
+
     def init(self) -> TrackerState:
         """The state before the first frame: no objects."""
-        m = self.max_objects
-        state = TrackerState(
-            objects=Gaussian.nowhere(m),
-            lives=Lives.initial(m),
+        none = np.zeros(0, int)
+        return TrackerState(
+            objects=Gaussian.none(),
+            lives=Lives.begun(none, none, at_once=False),
             coasting=Coasting.initial(),
-            duplicates=Duplicates.initial(m),
-            scores=ScoreState.initial(m),
+            duplicates=Duplicates.initial(),
+            scores=ScoreState.initial(),
             camera=CameraState.initial(),
-            noise=NoiseState.initial(m, float(self.frames_per_second)),
-            colours=zeros(m, _BANDS * _COLOURS.num_bins),
+            noise=NoiseState.initial(self.rate),
+            colours=np.zeros((0, _BANDS * _COLOURS.num_bins)),
+            last_identity=0,
+            full=False,
+            begun=False,
+            waited=0.0,
+            time=None,
+            number=0,
+            left_out=np.zeros(len(FAULTS), int),
         )
-        return jax.tree.map(jnp.asarray, state)
 
     @checked
     def step(
@@ -120,240 +119,261 @@ class ObjectTracker(Checked):
         frame: UInt8[np.ndarray, "h w 3"] | None,
         detections: Any,
         motion: CameraMotion | None = None,
+        *,
+        time: Finite | None = None,
+        frame_size: tuple[int, int] | None = None,
     ) -> tuple[TrackerState, Tracks]:
         """The state after a frame and its detections, and the tracks in it.
 
         `detections` are what a detector of `track` gives: boxes, (boxes, scores), or (boxes,
-        scores, classes). There is room for twice `max_objects`; `Detections` have room of your own.
-        Where `frame` is None detections are tracked alone, without colours. `motion` is what
-        `OpticalFlow` makes of the frames; None leaves the camera's motion to the detections.
-        Nothing is drawn: the key may be None. Raises `ValueError` for a frame that is not (h, w, 3)
-        of type uint8, for boxes as `Detections.from_boxes` does, and for anything but a state of
-        `init`.
+        scores, classes); None where it did not run, which is not "nothing there". Those that cannot
+        be tracked are left out as by `track`, and counted in the state. Where `frame` is None they
+        are tracked alone, without colours. Nothing is drawn: the key may be None.
+
+        - `motion`: what `OpticalFlow` makes of the frames; None leaves it to the detections.
+        - `time`: in seconds, for frames that are not equally far apart; None takes the frame after
+          the last, by `frames_per_second`.
+        - `frame_size`: height and width, where there is no frame and they are known.
+
+        Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, for a time that is not
+        after the one before, and for detections as `Detections.of` does.
         """
         del key
-        if not isinstance(detections, Detections):
-            boxes, scores, classes = DetectedBoxes.of(detections, "detections")
-            size = None if frame is None else np.shape(frame)[:2]
-            detections = Detections.from_boxes(
-                boxes, 2 * self.max_objects, scores, frame_size=size, classes=classes
-            )
-        seen = None if frame is None else colours_of(frame, detections)
-        return _advanced(self, state, detections, seen, motion)
+        found = None
+        if detections is not None:
+            named = f"detections: frame {state.number + 1}"
+            size = frame_size if frame is None else np.shape(frame)[:2]
+            found = Found.of(Detections.of(detections, named), named, size)
+            if frame is not None:
+                found = coloured(found, frame)
+        return advanced(self, state, found, motion, time)
 
 
-def colours_of(frame: UInt8[np.ndarray, "h w 3"], detections: Detections) -> SampledBoxes:
-    """The part of a frame that a step needs: the detections' colours."""
-    return SampledBoxes.of(np.asarray(frame), np.asarray(detections.boxes), _COLOURS)
-
-
-class _Found(NamedTuple):
-    """The detections of a frame, and what they are to each other.
-
-    - `places`: (d, 4); `classes`: (d,), 0 where they do not matter; `extent`: of the frame.
-    - `colours`: (d, bins), None without pixels.
-    - `stronger`: (d, d), whether the first of a pair is; `overlaps`: (d, d), of what may be one.
-    """
-
-    detections: Detections
-    places: Float[Array, "d 4"]
-    classes: Int[Array, " d"]
-    extent: Float[Array, "4"]
-    colours: Float[Array, "d bins"] | None
-    stronger: Bool[Array, "d d"]
-    overlaps: Float[Array, "d d"]
-
-    @classmethod
-    def of(
-        cls, tracker: ObjectTracker, detections: Detections, seen: SampledBoxes | None
-    ) -> "_Found":
-        """Compare all with all."""
-        if tracker.scores == "ignore":
-            same = jnp.ones_like(detections.scores)
-            detections = eqx.tree_at(lambda found: found.scores, detections, same)
-        colours, extent, boxes = None, detections.extent, detections.boxes
-        if seen is not None:
-            extent = jnp.array([0, 0, 1, 1]) * jnp.tile(jnp.stack([seen.width, seen.height]), 2)
-            extent = extent.astype(boxes.dtype)
-            colours = normalise(seen.counts(_BANDS)).reshape(len(boxes), -1)
-        classes = detections.classes if tracker.class_matters else 0
-        classes = jnp.broadcast_to(classes, detections.valid.shape).astype(jnp.int32)
-        ranked = stronger(detections.scores, jnp.prod(boxes[:, 2:], axis=1))
-        overlaps = jnp.where(_may_be_one(tracker, classes, classes), overlap(boxes, boxes), 0.0)
-        return cls(detections, places_of(boxes), classes, extent, colours, ranked, overlaps)
-
-    def strong(self, least: Float[Array, ""]) -> Bool[Array, " d"]:
-        """Which detections have at least this score."""
-        return self.detections.valid & (self.detections.scores >= least)
+def coloured(found: Found, frame: UInt8[np.ndarray, "h w 3"]) -> Found:
+    """With the colours of the detections, the part of a frame that a step needs."""
+    histograms = sampled_histograms(frame, found.boxes, _COLOURS, _BANDS)
+    return found._replace(colours=histograms.reshape(len(histograms), _BANDS * _COLOURS.num_bins))
 
 
 class _Taken(NamedTuple):
-    """The detection of each object: its row, whether there is any, and a strong one; its place."""
+    """The detection of each object: its row, -1 for none, whether there is any, a strong one."""
 
-    rows: Int[Array, " m"]
-    there: Bool[Array, " m"]
-    strong: Bool[Array, " m"]
-    place: Float[Array, "m 4"]
+    rows: Int[np.ndarray, " m"]
+    there: Bool[np.ndarray, " m"]
+    strong: Bool[np.ndarray, " m"]
 
     @classmethod
-    def of(cls, source: Int[Array, " m"], strong: Bool[Array, " d"], found: _Found) -> "_Taken":
-        """By the rows, -1 for none."""
-        rows, there = jnp.maximum(source, 0), source >= 0
-        return cls(rows, there, there & strong[rows], found.places[rows])
+    def of(cls, rows: Int[np.ndarray, " m"], strong: Bool[np.ndarray, " d"]) -> "_Taken":
+        """By the rows."""
+        return cls(rows, rows >= 0, np.append(strong, False)[rows])
 
-    def values(self, values: Array, none: Any) -> Array:
+    def values(self, values: np.ndarray, none: Any) -> np.ndarray:
         """The value of each object's detection, or another where there is none."""
-        return jnp.where(self.there.reshape(-1, *[1] * (values.ndim - 1)), values[self.rows], none)
+        filled = np.concatenate([values, np.full((1, *values.shape[1:]), none, values.dtype)])
+        return filled[self.rows]
 
 
 def advanced(
     tracker: ObjectTracker,
     state: TrackerState,
-    detections: Detections,
-    seen: SampledBoxes | None = None,
+    found: Found | None,
     motion: CameraMotion | None = None,
+    time: float | None = None,
 ) -> tuple[TrackerState, Tracks]:
-    """A step as a pure function, for `jax.lax.scan` and for programs of your own."""
-    found = _Found.of(tracker, detections, seen)
-    spans = Spans.at(jnp.asarray(tracker.frames_per_second))
-    unlike = _unlikeness(tracker, state, found)
-    predicted, noise, camera, shift = _moved(state, found, unlike, motion)
-    scores = state.scores.after(
-        found.detections, found.stronger, found.overlaps, shift, spans.lasting
-    )
+    """A step with what was found, or None where no detector ran."""
+    frames, before = 1.0, state.time
+    if time is not None and before is not None:
+        if time <= before:
+            raise ValueError(f"time: {time} s is not after that of the frame before, {before} s")
+        frames = (time - before) * tracker.rate
+    if time is None and before is not None:
+        time = before + 1 / tracker.rate
+    state, gone, chains = _carried(state, motion, frames)
+    frames += state.waited
+    state = state._replace(number=state.number + 1, time=time, waited=frames)
+    if found is None:
+        return _unseen(state, chains)
+    found.warn_of_first(state.left_out)
+    if tracker.scores == "ignore":
+        found = found._replace(scores=np.ones_like(found.scores))
+    if not tracker.class_matters:
+        found = found._replace(classes=np.zeros_like(found.classes))
+    spans, lives = Spans.at(tracker.rate, tracker.lost_seconds), state.lives
+    places, unlike = found.places, _unlikeness(tracker, state, found)
+    doubles = overlap(found.boxes, found.boxes)
+    doubles[~_may_be_one(tracker, found.classes, found.classes)] = 0.0
+    state, shift = _with_camera(state, found, places, unlike, motion, gone)
+    chains = chains + np.append(shift, [0, 0])
+    scores = state.scores.after(found.boxes, found.scores, doubles, chains, frames, spans.lasting)
     if tracker.scores == "as_given":
-        weak, strong = (jnp.full_like(scores.weak, score) for score in (WEAK, STRONG))
-        scores = scores._replace(weak=weak, strong=strong)
-    strong = found.strong(scores.strong)
+        scores = scores._replace(weak=WEAK, strong=STRONG)
+    strong = found.scores >= scores.strong
 
-    errors, speed = noise.noises.errors, noise.noises.speed
-    cost = mahalanobis(predicted, errors, found.places) + unlike
-    source, probability = _associated(state, cost, strong, found.strong(scores.weak))
-    taken = _Taken.of(source, strong, found)
-    error = units(taken.place) * errors[None] * jnp.where(taken.strong, 1.0, WEAK_ERROR)[:, None]
-    updated, _, _ = predicted.updated(taken.place, error)
-    objects = updated.mixed_with(predicted, probability[:, None])
+    predicted, noises = state.objects, state.noise.noises
+    cost = mahalanobis(predicted, noises.errors, places) + unlike
+    source, probability = _associated(state, cost, strong, found.scores >= scores.weak)
+    taken, rows = _Taken.of(source, strong), np.flatnonzero(source >= 0)
+    before, place = predicted.at(rows), places[source[rows]]
+    wider = np.where(taken.strong[rows], 1.0, WEAK_ERROR)[:, None]
+    updated, _, _ = before.updated(place, units(place) * noises.errors * wider)
+    objects = Gaussian(*map(np.copy, predicted))
+    objects.put(rows, updated.mixed_with(before, probability[rows, None]))
 
-    inside = within(boxes_of(objects.place), found.extent, centred=~taken.there)
     coast = state.coasting.longest(spans)
-    lives = state.lives.counted(taken.there, taken.strong, inside, spans, coast)
-    right = shared(boxes_of(predicted.place), found.detections.boxes[taken.rows]) >= _SAME
-    coasting = state.coasting.after(state.lives, lives, taken.there, right, spans)
+    counted, stays = lives.counted(taken.there, taken.strong, frames, spans, coast, state.full)
+    stays &= within(boxes_of(objects.place), found.extent, centred=~taken.there)
+    right = taken.there.copy()
+    right[rows] = shared(boxes_of(before.place), found.boxes[source[rows]]) >= _SAME
+    ended = lives.confirmed & np.where(taken.there, ~right, ~stays)
+    unseen = lives.unseen + np.where(taken.there, 0.0, frames)
+    coasting = state.coasting.after(unseen, lives.confirmed & right, ended, spans)
 
-    stays, wanted = lives.alive, _unexplained(tracker, state, lives, objects, found, source, strong)
-    begun = seated(wanted, found.stronger, ~stays)
-    taken, born = _Taken.of(jnp.where(stays, source, begun), strong, found), begun >= 0
-    unit = units(taken.place)
-    start = Gaussian.begun(taken.place, unit * errors[None], unit * speed[None])
-    objects = start.where(born, objects)
-    lives = lives.begins(born, taken.values(found.classes, 0), jnp.sum(wanted, dtype=jnp.int32))
+    wanted = _unexplained(tracker, state, objects.at(stays), stays, found, doubles, source, strong)
+    born = np.flatnonzero(wanted)[: tracker.max_objects - np.sum(stays)]
+    teaches = taken.strong & stays
+    known = teaches & counted.confirmed & (counted.seen >= _FIRST)
+    grown = objects.at(teaches & (counted.seen == _FIRST))
+    speed = noises.speed
+    noise = state.noise.after(rows, before.unit, place, known[rows], grown)
+    moments = noise.moments.at(stays).joined(noise.begun(places[born], speed))
+    unit = units(places[born])
+    start = Gaussian.begun(places[born], unit * noises.errors, unit * speed)
+    objects = objects.at(stays).joined(start)
+    names = state.last_identity + 1 + np.arange(len(born))
+    begun = Lives.begun(names, found.classes[born], at_once=not state.begun)
+    taken = _Taken.of(np.append(source[stays], born), strong)
+    lives = counted.at(stays).joined(begun).classified(taken.values(found.classes, 0))
 
     boxes = boxes_of(objects.place)
-    alike = _may_be_one(tracker, lives.classes, lives.classes)
-    overlaps = jnp.where(alike, overlap(boxes, boxes), 0.0)
+    overlaps = overlap(boxes, boxes)
+    overlaps[~_may_be_one(tracker, lives.classes, lives.classes)] = 0.0
     duplicates = state.duplicates.after(lives.identities, stays, taken.there, overlaps)
     lives = lives._replace(shown=lives.shown & ~duplicates.doubtful)
-    teaches, there = taken.strong & stays, taken.there & stays
-    known, grown = teaches & lives.confirmed & (lives.seen >= _FIRST), lives.seen == _FIRST
-    noise = noise.after(taken.place, there, known, born, teaches & grown, objects)
-    colours = state.colours
+    colours = np.append(state.colours[stays], np.zeros((len(born), state.colours.shape[1])), axis=0)
     if found.colours is not None:
-        others = lives.alive[None] & ~jnp.eye(len(boxes), dtype=bool)
-        alone = ~jnp.any((overlaps > _CONTACT) & others, axis=1)
-        kept = jnp.where(born[:, None], 0.0, colours)
-        colours = learned_colours(kept, taken.values(found.colours, 0.0), alone)
-    state = TrackerState(objects, lives, coasting, duplicates, scores, camera, noise, colours)
-    rows = detections.rows_of(jnp.where(taken.there, taken.rows, -1))
-    probability = jnp.where(born, 1.0, jnp.where(stays, probability, 0.0))
-    told = lives.identities, lives.confirmed, lives.unseen, lives.full, lives.shown
-    return state, Tracks(boxes, *told, rows, probability, lives.classes)
+        alone = np.sum(overlaps > _CONTACT, axis=1) <= 1  # each overlaps itself
+        colours = learned_colours(colours, taken.values(found.colours, 0.0), alone)
+    state = TrackerState(
+        objects, lives, coasting, duplicates, scores, state.camera,
+        noise._replace(moments=moments), colours,
+        last_identity=state.last_identity + len(born), full=bool(np.sum(wanted) > len(born)),
+        begun=True, waited=0.0, time=time, number=state.number,
+        left_out=state.left_out + found.left_out,
+    )  # fmt: skip
+    probability = np.append(probability[stays], np.ones(len(born)))
+    left_out = int(found.left_out.sum())
+    return state, _tracks(state, taken.values(found.rows, -1), probability, left_out)
 
 
-_advanced = eqx.filter_jit(advanced)
+def _unseen(state: TrackerState, chains: np.ndarray) -> tuple[TrackerState, Tracks]:
+    """A frame on which no detector ran: objects move on, and nothing is held against them."""
+    scores = state.scores._replace(boxes=chains)
+    state = state._replace(scores=scores, full=False)
+    none = np.zeros(len(state.lives.seen))
+    return state, _tracks(state, none.astype(int) - 1, none, 0)
+
+
+def _tracks(
+    state: TrackerState, rows: np.ndarray, probability: np.ndarray, left_out: int
+) -> Tracks:
+    lives = state.lives
+    told = lives.identities, lives.confirmed, lives.unseen, state.full, lives.shown
+    boxes = boxes_of(state.objects.place)
+    return Tracks(boxes, *told, rows, probability, lives.classes, left_out)
 
 
 def _may_be_one(
-    tracker: ObjectTracker, a: Int[Array, " m"], b: Int[Array, " d"]
-) -> Bool[Array, "m d"]:
+    tracker: ObjectTracker, a: Int[np.ndarray, " m"], b: Int[np.ndarray, " d"]
+) -> Bool[np.ndarray, "m d"]:
     """Whether boxes of these classes may be of one object."""
     return compatible(a, b) | (tracker.class_matters == "prefers")
 
 
-def _unlikeness(tracker: ObjectTracker, state: TrackerState, found: _Found) -> Float[Array, "m d"]:
+def _unlikeness(
+    tracker: ObjectTracker, state: TrackerState, found: Found
+) -> Float[np.ndarray, "m d"]:
     """What pairs cost beside distance: for their colours and classes, and infinitely if need be."""
-    cost = unlikeness(found.colours, state.colours)
-    if tracker.class_matters == "prefers":
-        cost += jnp.where(compatible(state.lives.classes, found.classes), 0.0, _CLASS_COST)
-    return jnp.where(_may_be_one(tracker, state.lives.classes, found.classes), cost, jnp.inf)
+    alike = compatible(state.lives.classes, found.classes)
+    cost = np.where(alike, 0.0, _CLASS_COST if tracker.class_matters == "prefers" else np.inf)
+    return cost if found.colours is None else cost + unlikeness(found.colours, state.colours)
 
 
-def _moved(
-    state: TrackerState,
-    found: _Found,
-    unlike: Float[Array, "m d"],
-    motion: CameraMotion | None,
-) -> tuple[Gaussian, NoiseState, CameraState, Float[Array, "#c 2"]]:
-    """Objects a frame later, moved with the camera, and by how far it moves chains of boxes."""
-    before, noise, gone, away = state.objects, state.noise, jnp.zeros((1, 2)), jnp.zeros((1, 2))
-    deviations = state.camera.deviations
+def _carried(
+    state: TrackerState, motion: CameraMotion | None, frames: float
+) -> tuple[TrackerState, Float[np.ndarray, "m 2"], Float[np.ndarray, "c 4"]]:
+    """All so many frames later, and moved with the picture.
+
+    Also by how far the picture moves the objects, and the boxes of the chains.
+    """
+    objects, noise, chains = state.objects, state.noise, state.scores.boxes
     if motion is not None:
-        carried = motion.carried(before)
-        gone = (carried.place - before.place)[:, :2]
-        chains = Gaussian(*[state.scores.boxes] * 5)
-        away = (motion.carried(chains).place - chains.place)[:, :2]
-        before, noise = carried, noise._replace(moments=motion.carried(noise.moments))
-        deviations = jnp.where(motion.known, state.camera.left, deviations)
-    errors, place, velocity, _ = noise.noises
-    objects = before.predicted(place[None], velocity[None])
-    confirmed, lately = state.lives.confirmed, state.lives.unseen == 0
-    pairs = jnp.where(found.strong(state.scores.weak)[None], unlike, jnp.inf)
-    seen = jnp.where(confirmed & lately, state.lives.seen, 0)
-    jolt = jolted(objects, errors, found.places, pairs, seen)
-    objects, gone = objects.shifted(jolt), gone + jolt[None]
-    number = jnp.maximum(jnp.sum(confirmed, dtype=objects.place.dtype), 1.0)
-    box = jnp.exp(jnp.sum(jnp.where(confirmed[:, None], objects.place[:, 2:], 0.0), 0) / number)
-    cost = mahalanobis(objects, errors, found.places, 2 * deviations * box) + unlike
-    pairs = confirmed[:, None] & found.strong(state.scores.strong)[None]
-    cost = jnp.where(pairs, cost, jnp.inf)
-    known = jnp.asarray(False) if motion is None else jnp.asarray(motion.known)
-    camera, shift = state.camera.after(objects, gone, known, cost, errors, found.places, box)
-    noise = noise._replace(moments=noise.moments.shifted(jolt + shift))
-    return objects.shifted(shift), noise, camera, away + (jolt + shift)[None]
+        objects = motion.carried(objects)
+        noise = noise._replace(moments=motion.carried(noise.moments))
+        chains = np.concatenate([motion.moved(chains[:, :2]), chains[:, 2:]], axis=1)
+    gone = (objects.place - state.objects.place)[:, :2]
+    unit, (_, place, velocity, _) = objects.unit, noise.noises
+    objects, noise = objects.predicted(place, velocity, unit, frames), noise.predicted(unit, frames)
+    return state._replace(objects=objects, noise=noise), gone, chains
+
+
+def _with_camera(
+    state: TrackerState,
+    found: Found,
+    places: Float[np.ndarray, "d 4"],
+    unlike: Float[np.ndarray, "m d"],
+    motion: CameraMotion | None,
+    gone: Float[np.ndarray, "m 2"],
+) -> tuple[TrackerState, Float[np.ndarray, "2"]]:
+    """Objects moved with what they have in common beside the motion from pixels, and by how far."""
+    lives, errors = state.lives, state.noise.noises.errors
+    known = motion is not None and bool(motion.known)
+    seen = np.where(lives.confirmed & (lives.unseen == 0), lives.seen, 0)
+    counts = found.scores >= state.scores.weak
+    jolt = jolted(state.objects, errors, places[counts], unlike[:, counts], seen)
+    objects, camera = state.objects.shifted(jolt), state.camera
+    confirmed, strong = lives.confirmed, found.scores >= state.scores.strong
+    box = np.exp(objects.place[confirmed, 2:].sum(axis=0) / max(confirmed.sum(), 1))
+    slack = 2 * (camera.left if known else camera.deviations) * box
+    sure, detected = objects.at(confirmed), places[strong]
+    cost = mahalanobis(sure, errors, detected, slack) + unlike[np.ix_(confirmed, strong)]
+    camera, shift = camera.after(sure, gone[confirmed] + jolt, known, cost, errors, detected, box)
+    shift = jolt + shift
+    noise = state.noise._replace(moments=state.noise.moments.shifted(shift))
+    objects = state.objects.shifted(shift)
+    return state._replace(objects=objects, noise=noise, camera=camera), shift
 
 
 def _associated(
     state: TrackerState,
-    cost: Float[Array, "m d"],
-    strong: Bool[Array, " d"],
-    counts: Bool[Array, " d"],
-) -> tuple[Int[Array, " m"], Float[Array, " m"]]:
+    cost: Float[np.ndarray, "m d"],
+    strong: Bool[np.ndarray, " d"],
+    counts: Bool[np.ndarray, " d"],
+) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """The detection of each object, -1 for none, and the probability that it is its own."""
-    cost += jnp.where(strong, 0.0, _WEAK_COST)[None]
-    cost += jnp.where(state.lives.confirmed, 0.0, _DOUBT_COST)[:, None]
-    possible = state.lives.alive[:, None] & counts[None] & (cost < 0)
-    cost = jnp.where(state.duplicates.doubtful[:, None], _YIELDING * cost, cost)
-    cost = jnp.where(possible, cost, jnp.inf)
+    cost = cost + np.where(strong, 0.0, _WEAK_COST)
+    cost += np.where(state.lives.confirmed, 0.0, _DOUBT_COST)[:, None]
+    possible = counts & (cost < 0)
+    cost = np.where(state.duplicates.doubtful[:, None], _YIELDING * cost, cost)
+    cost = np.where(possible, cost, np.inf)
     source = one_to_one(cost)
-    chosen = jnp.maximum(source, 0)[:, None]
-    probability = jnp.take_along_axis(probabilities(cost), chosen, axis=1)[:, 0]
-    return source, jnp.where(source >= 0, probability, 0.0)
+    rows, probability = np.flatnonzero(source >= 0), np.zeros(len(source))
+    probability[rows] = probabilities(cost)[rows, source[rows]]
+    return source, probability
 
 
 def _unexplained(
     tracker: ObjectTracker,
     state: TrackerState,
-    lives: Lives,
     objects: Gaussian,
-    found: _Found,
-    source: Int[Array, " m"],
-    strong: Bool[Array, " d"],
-) -> Bool[Array, " d"]:
+    stays: Bool[np.ndarray, " m"],
+    found: Found,
+    doubles: Float[np.ndarray, "d d"],
+    source: Int[np.ndarray, " m"],
+    strong: Bool[np.ndarray, " d"],
+) -> Bool[np.ndarray, " d"]:
     """Which strong detections begin an object: no object has them, or is there already."""
-    boxes = found.detections.boxes
-    covered = lives.alive[:, None] & (overlap(boxes_of(objects.place), boxes) > _BIRTH_OVERLAP)
-    covered &= _may_be_one(tracker, state.lives.classes, found.classes)
-    past = jnp.where(source >= 0, source, len(strong))  # a scatter drops it
-    free = jnp.ones_like(strong).at[past].set(False, mode="drop")
-    wanted = strong & free & within(boxes, found.extent) & ~jnp.any(covered, axis=0)
-    duplicates = (found.overlaps > _BIRTH_OVERLAP) & wanted[:, None] & found.stronger
-    return wanted & ~jnp.any(duplicates, axis=0)
+    covered = overlap(boxes_of(objects.place), found.boxes) > _BIRTH_OVERLAP
+    covered &= _may_be_one(tracker, state.lives.classes[stays], found.classes)
+    wanted = strong & within(found.boxes, found.extent) & ~covered.any(axis=0)
+    wanted[source[source >= 0]] = False
+    return wanted & ~(np.triu(doubles > _BIRTH_OVERLAP, 1) & wanted[:, None]).any(axis=0)
