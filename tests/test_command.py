@@ -216,7 +216,7 @@ def test_warnings_are_a_line_each(sequence, tmp_path, capsys):
     assert run(sequence, "--detections", rows, "--out", tmp_path / "out", *SMALL) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
     assert len(lines) == 2
-    assert "frame 3 has boxes outside the frame, 64 x 48" in lines[0]
+    assert "detections: frame 3, row 2, " in lines[0]
     assert "1 lie in frames after the last, 7" in lines[1]
 
 
@@ -376,7 +376,7 @@ def test_a_folder_of_detections_is_tracked_and_scored_without_pixels(alone, tmp_
     assert (summary["frames"], summary["objects"], summary["frames_without_room"]) == (9, 2, 0)
     assert summary["HOTA"] > 0.7
     assert summary["IDF1"] > 0.8
-    assert "frame 3 has boxes outside the frame, 64 x 48" in capsys.readouterr().err
+    assert "detections: frame 3, row 2, " in capsys.readouterr().err
     # A file of its own folder knows as much, and one that lies elsewhere the detections alone.
     assert run(alone / "det.txt", "--out", tmp_path / "file", *SMALL) == 0
     assert summary_in(tmp_path / "file")["HOTA"] == summary["HOTA"]
