@@ -149,9 +149,9 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
     """The requested tracker; raises for any fault in the arguments."""
     options, source = results.options, results.source
     key = jax.random.key(options.seed)
-    if options.box is not None and still is None:
-        raise ValueError(f"--box: frame {source.first}, in which they are, cannot be decoded")
     if options.box is not None:
+        if still is None:
+            raise ValueError(f"--box: frame {source.first}, in which they are, cannot be decoded")
         boxes = results.drawn = read_boxes(options, still)
         return lambda stills: follow_boxes(stills or (), boxes, key=key)
     rows = None if source.rows is None else Rows(source.rows, last=source.last)
@@ -184,7 +184,7 @@ def _track(results: Results, start: Start) -> None:
     options, source, clock = results.options, results.source, results.clock
     untracked: collections.deque[np.ndarray | None] = collections.deque()
 
-    def watched(stills: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    def watched(stills: Iterator[Any]) -> Iterator[Any]:
         for still in results.ahead.over("read", stills):
             untracked.append(still)
             yield still

@@ -25,10 +25,8 @@ _X264 = {"crf": "19", "preset": "veryfast", "x264-params": "rc-lookahead=30:subm
 
 
 @checked
-def read_frames(
-    path: str | Path, first: Count = 1, last: Count | None = None
-) -> Iterator[UInt8[np.ndarray, "h w 3"] | None]:
-    """Read frames `first` to `last`, both included and counted from 1, in RGB, one at a time.
+def read_frames(path: str | Path, first: Count = 1, last: Count | None = None) -> Iterator[Any]:
+    """Read frames `first` to `last`, both included and counted from 1: arrays (h, w, 3), in RGB.
 
     `path` is a video file, a folder of images in the natural order of their names (2.png before
     10.png), or a folder with such a folder `img` or `img1`. All frames of a video are read,

@@ -80,7 +80,7 @@ def as_detector(detections: Any) -> Detector:
 
 
 def observed(
-    stills: Iterator[np.ndarray] | None, detector: Detector, first: int
+    stills: Iterator[np.ndarray | None] | None, detector: Detector, first: int
 ) -> Iterator[tuple[int, np.ndarray | None, Detections | None]]:
     """Number, pixels and detections of each frame; None where no detector ran.
 
