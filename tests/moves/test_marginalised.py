@@ -223,7 +223,7 @@ def test_optimal_resampling_keeps_heavy_children_and_none_twice():
     child = after.ancestor_indices * NUM_REGIMES + after.particles.latent
     assert all(len(set(row)) == NUM_PARTICLES for row in child)
     # The children's own weights, and the threshold by trying all numbers of heavy ones.
-    _, _, log_factors = children(MODEL, OBSERVATIONS[4], start.particles)
+    _, _, log_factors = children(Step(MODEL, OBSERVATIONS[4]), start.particles)
     weights = np.exp(np.asarray(start.log_weights[None] + log_factors, float)).T.ravel()
     weights /= weights.sum()
     falling = np.sort(weights)[::-1]
