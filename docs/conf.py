@@ -55,7 +55,7 @@ autodoc_typehints = "signature"
 autodoc_default_options = {
     "members": True,
     # What every move has of its kind; the kinds themselves show it.
-    "exclude-members": "regroup, forget, initial_memory",
+    "exclude-members": "regroup, initial_memory",
 }
 maximum_signature_line_length = 80
 python_use_unqualified_type_names = True
