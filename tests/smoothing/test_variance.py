@@ -123,7 +123,7 @@ def test_averages_of_pairs_are_close_to_the_pairs_themselves(num_components):
             assert np.corrcoef(ours, theirs)[0, 1] > 0.97
     plain = mpfjax.monte_carlo(keys, filter, SQUARES, nothing)
     np.testing.assert_array_equal(plain.final.particles, runs.final.particles)
-    assert len(with_first_ancestors(own)._initial_moves) == len(filter._initial_moves) + 1
+    assert len(with_first_ancestors(own).initial_moves) == len(filter.initial_moves) + 1
     last = jax.tree.map(lambda leaf: leaf[0], runs.final)
     moved, info = own.step(keys[0], last, SQUARES[0])
     np.testing.assert_allclose(info.mixture_weight_errors, mixture_weight_errors(moved), atol=1e-5)
