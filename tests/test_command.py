@@ -57,7 +57,7 @@ def still_objects(number, num_frames):
 
 
 def write_detections(path, *rows):
-    np.savetxt(path, np.concatenate(rows), delimiter=",", fmt="%g")
+    np.savetxt(path, np.concatenate(rows), delimiter=",", fmt="%.9g")
     return path
 
 
@@ -386,6 +386,20 @@ def test_a_folder_of_detections_is_tracked_and_scored_without_pixels(alone, tmp_
     assert "HOTA" not in summary_in(tmp_path / "walk")
     found = [read_tracks(folder / "tracks.txt") for folder in (tmp_path, tmp_path / "walk")]
     np.testing.assert_array_equal(found[0][found[0][:, 0] <= NUM_FRAMES], found[1])
+
+
+def test_a_late_clip_begins_at_its_first_row_and_a_far_row_is_named(tmp_path, capsys):
+    rows = detected()
+    rows[:, 0] += 100_000
+    path = write_detections(tmp_path / "late.txt", rows)
+    assert run(path, "--out", tmp_path, *SMALL) == 0
+    assert summary_in(tmp_path)["frames"] == NUM_FRAMES
+    assert read_tracks(tmp_path / "tracks.txt")[:, 0].min() > 100_000
+    far = write_detections(tmp_path / "far.txt", detected(), rows)
+    for options in ([], ["--frames", "2:"]):
+        assert run(far, "--out", tmp_path / "far", *options, *SMALL) == 2
+        assert f"row {len(rows)}, of frame 100001, comes" in capsys.readouterr().err
+    assert not (tmp_path / "far").exists()
 
 
 def test_frames_with_more_objects_than_room_are_counted(tmp_path, capsys):

@@ -22,6 +22,7 @@ from mpfjax.vision.files.sequences import (
     read_truth,
     sequence_of,
 )
+from mpfjax.vision.tracking.adapters import Rows, first_step
 
 DESCRIPTION = """\
 Track objects in a video or a folder of images. What to track comes from one of three: detections
@@ -164,9 +165,13 @@ def open_source(options: argparse.Namespace) -> Source:
         folder = path if path.is_dir() else sequence_of(path) or path
         info = read_sequence_info(folder)
     truth, end = find_truth(folder, options.truth, first, last), last
-    if not has_pixels:
-        known = (rows, None if truth is None else truth.objects)
-        held = last_frame(info, *(found for found in known if found is not None))
+    if rows is not None and not has_pixels:
+        known = [rows[:, :6], *([] if truth is None else [truth.objects])]
+        held = last_frame(info, *known)
+        if last is None and info.length is None:
+            begin = first if options.frames else None
+            rate = options.fps or info.frame_rate or 25
+            first = first_step(Rows(np.concatenate(known)), begin, rate)
         last = end = min(last or held, held)
         if last < first:
             raise ValueError(f"SOURCE: {path} holds {held} frames, and no frame {first}")

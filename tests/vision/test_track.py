@@ -218,6 +218,48 @@ def test_a_frame_that_a_mapping_has_not_is_one_without_a_detector():
     assert all(tracks.shown.sum() == 2 for tracks in tracked(None, some))
 
 
+# --- which frames there are -----------------------------------------------------------------------
+
+
+def rows_at(*numbers):
+    """A row of one still object in each of these frames."""
+    return np.array([[number, -1, 20.0, 10, 12, 30, 0.9] for number in numbers]).reshape(-1, 7)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "steps"),
+    [((100_001, 100_002, 100_004), 4), (1_732_665_600_000 + 40 * np.arange(3), 81), ((), 0)],
+    ids=["a late clip", "milliseconds", "none"],
+)
+def test_steps_without_pixels_begin_at_the_first_row(numbers, steps):
+    by_number = {number: rows_at(number)[:, 2:6] for number in numbers}
+    for detections in (rows_at(*numbers), by_number):
+        assert len(list(track(None, detections))) == steps
+
+
+@pytest.mark.parametrize(
+    ("numbers", "options", "named"),
+    [
+        ((2, 1, 99_999), {}, "row 2, of frame 99999, comes 99997 frames after what is before it"),
+        ((99_999,), {"first": 7}, "row 0, of frame 99999, comes 99992 frames after frame 7"),
+        ((1, 1502), {}, "row 1, .* a minute has 1500"),
+    ],
+)
+def test_a_row_that_is_a_minute_later_is_named(numbers, options, named):
+    with pytest.raises(ValueError, match=f"detections: .*{named}"):
+        track(None, rows_at(*numbers), **options)
+    by_number = {number: rows_at(number)[:, 2:6] for number in numbers}
+    with pytest.raises(ValueError, match=r"detections: frame .*, and a minute has 1500"):
+        track(None, by_number, **options)
+
+
+def test_a_minute_without_rows_passes_where_it_is_filmed_or_less():
+    assert len(list(track(None, rows_at(1, 1501)))) == 1501
+    fast = ObjectTracker(2, frames_per_second=100)
+    assert next(track(None, rows_at(1, 5000), fast)).identities.size
+    next(track(stills(1), rows_at(1, 5000)))
+
+
 # --- which detection is whose ---------------------------------------------------------------------
 
 

@@ -39,24 +39,27 @@ class Rows:
         for number in np.flatnonzero(bad.filled(False))[:1]:
             row = shown(rows.data[number])
             raise ValueError(f"detections: row {number}, {row}, is of no frame; they count from 1")
-        rows = rows[~np.ma.getmaskarray(rows)[:, 0]]
-        rows = rows[np.argsort(rows.data[:, 0], kind="stable")]
-        self._rows, self._frames = rows, rows.data[:, 0].astype(int)
-        self.last = int(self._frames.max(initial=0)) if last is None else last
+        # Which row each is, in the order of the frames.
+        places = np.flatnonzero(~np.ma.getmaskarray(rows)[:, 0])
+        self.places = places[np.argsort(rows.data[places, 0], kind="stable")]
+        self._rows = rows[self.places]
+        self.frames = self._rows.data[:, 0].astype(int)
+        self.is_limited = last is not None
+        self.last = int(self.frames.max(initial=0)) if last is None else last
 
     def of_frame(self, number: int) -> tuple[np.ndarray, np.ndarray | None]:
         """The boxes and scores of a frame."""
-        begin, end = np.searchsorted(self._frames, [number, number + 1])
+        begin, end = np.searchsorted(self.frames, [number, number + 1])
         rows = self._rows[begin:end]
         return rows[:, _BOX], rows[:, _SCORE] if rows.shape[1] > _SCORE else None
 
     def num_after(self, last: int) -> int:
         """How many rows lie in later frames."""
-        return int(np.sum(self._frames > last))
+        return int(np.sum(self.frames > last))
 
     def most_objects(self) -> int:
         """One and a half times the number of detections in all but the fullest frames."""
-        counts = np.unique(self._frames, return_counts=True)[1]
+        counts = np.unique(self.frames, return_counts=True)[1]
         usual = float(np.quantile(counts, 0.95)) if len(counts) else 0.0
         return int(np.clip(8 * np.ceil(1.5 * usual / 8), LEAST_ROOM, MOST_ROOM))
 
@@ -77,6 +80,30 @@ def as_detector(detections: Any) -> Detector:
     if is_detector or isinstance(detections, Rows | Mapping) or is_series(detections):
         return detections
     raise ValueError(f"detections: {shown(detections)} is no detector, rows, file or boxes a frame")
+
+
+def first_step(detector: Detector, first: int | None, frames_per_second: float) -> int:
+    """The number of the first frame where there are no pixels: that of the first row, if not given.
+
+    Frame numbers decide how many steps there are: those of several clips, or times, would make many
+    of nothing. Raises `ValueError` for a row that comes more than a minute after the one before it,
+    unless the last frame is given.
+    """
+    if not isinstance(detector, Rows | Mapping):
+        return first or 1
+    is_rows = isinstance(detector, Rows)
+    frames = detector.frames if is_rows else np.array(sorted(detector), int)
+    first = first or int(frames[0] if len(frames) else 1)
+    most, gaps = int(60 * frames_per_second), np.diff(frames, prepend=first)
+    late = [] if is_rows and detector.is_limited else np.flatnonzero(gaps > most)
+    for at in late[:1]:
+        row = f"row {detector.places[at]}, of " if is_rows else ""
+        before = "what is before it" if at else f"frame {first}, the first"
+        raise ValueError(
+            f"detections: {row}frame {frames[at]}, comes {gaps[at]} frames after {before}, and a"
+            f" minute has {most}; number the frames one by one, and track apart what is far apart"
+        )
+    return first
 
 
 def observed(

@@ -12,7 +12,14 @@ from mpfjax.checks import Count, Finite, checked, one_of
 from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.files.frames import of_one_kind, read_frames
 from mpfjax.vision.files.threads import read_ahead
-from mpfjax.vision.tracking.adapters import LEAST_ROOM, Once, Rows, as_detector, observed
+from mpfjax.vision.tracking.adapters import (
+    LEAST_ROOM,
+    Once,
+    Rows,
+    as_detector,
+    first_step,
+    observed,
+)
 from mpfjax.vision.tracking.detections import Detections, Found
 from mpfjax.vision.tracking.gaussian import CameraMotion
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
@@ -27,7 +34,7 @@ def track(
     tracker: ObjectTracker | None = None,
     *,
     key: Key[Array, ""] | None = None,
-    first: Count = 1,
+    first: Count | None = None,
     min_score: Finite | None = None,
     max_detections: Count | None = None,
     use_colours: bool = True,
@@ -55,7 +62,8 @@ def track(
       has not, says that the detector did not run, which is not "nothing there".
     - `tracker`: None takes `ObjectTracker()`, with more room where a frame has more rows.
     - `key`: counts for nothing, since nothing is drawn.
-    - `first`: the number of the first frame, by which rows are found.
+    - `first`: the number of the first frame, by which rows are found. None is 1, and without
+      `frames` that of the first row.
     - `min_score`: detections with a lower score are left out; None leaves out none.
     - `max_detections`: the most detections in a frame; if there are more, the strongest are kept.
       None takes twice the tracker's `max_objects`.
@@ -74,11 +82,10 @@ def track(
     the first of each kind is warned of, and `Tracks.left_out` counts them. There are warnings for
     detections in frames after the last, and for more detections or objects than there is room for.
     Raises `ValueError` with the name of the argument for values that cannot be used, at the frame
-    in which they come, and `ImportError` for "pixels" without OpenCV. An exception of the detector
-    is passed on, with the number of the frame. Use it for recorded videos and for cameras.
+    in which they come, for a row more than a minute after the one before it where there are no
+    `frames`, and `ImportError` for "pixels" without OpenCV. An exception of the detector is passed
+    on, with the number of the frame. Use it for recorded videos and for cameras.
     """
-    if isinstance(frames, str | Path):
-        frames = read_frames(frames, first)
     del key
     detector = as_detector(detections)
     if frames is None and (callable(detector) or camera_motion == "pixels"):
@@ -86,6 +93,9 @@ def track(
     if tracker is None:
         of_rows = isinstance(detector, Rows)
         tracker = ObjectTracker(detector.most_objects() if of_rows else LEAST_ROOM)
+    first = (first_step(detector, first, tracker.rate) if frames is None else first) or 1
+    if isinstance(frames, str | Path):
+        frames = read_frames(frames, first)
     room = 2 * tracker.max_objects if max_detections is None else max_detections
     stills = None if frames is None else of_one_kind(frames, first)
     if camera_motion is None and stills is not None and use_colours and has_opencv():
