@@ -10,8 +10,9 @@ import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.vision import ObjectTracker
 from mpfjax.vision.tracking.camera import CameraState
-from mpfjax.vision.tracking.gaussian import Gaussian
+from mpfjax.vision.tracking.gaussian import Gaussian, units
 from mpfjax.vision.tracking.lives import Coasting, Duplicates, Spans
+from mpfjax.vision.tracking.noise import _GRID, NoiseState
 from mpfjax.vision.tracking.scores import ScoreState, rising
 
 M = 4
@@ -94,6 +95,27 @@ def test_who_moves_at_random_is_not_taken_for_a_bad_detector():
     assert (np.asarray(noises.velocity)[:2] > 0.01).all()
     assert (np.asarray(noises.errors)[:2] < 0.04).all()
     assert (np.asarray(noises.velocity)[2:] < 0.006).all()
+
+
+def test_each_candidate_is_a_filter_of_its_own_from_the_first_detection_on():
+    """Of a box that doubles in eight frames: candidates differ in its size, their unit."""
+    rng = np.random.default_rng(0)
+    seen = np.array([30.0, 60, 3, 3.5]) + np.arange(9)[:, None] * [1, 2, 0.09, 0.08]
+    seen += rng.normal(0, 0.05, seen.shape) * [2, 2, 1, 1]
+    speed, nobody = np.array([0.1, 0.05, 0.05, 0.03]), Gaussian.none()
+    state = NoiseState.initial(25.0)
+    state = state._replace(moments=state.begun(seen[:1], speed))
+    alone = [
+        Gaussian.begun(seen[:1], units(seen[:1]) * r, units(seen[:1]) * speed) for r, _, _ in _GRID
+    ]
+    for row in seen[1:]:
+        state = state.predicted(1.0).after(np.zeros(1, int), row[None], np.ones(1, bool), nobody)
+        for i, (error, place, velocity) in enumerate(_GRID):
+            now = alone[i].predicted(np.full(4, place), np.full(4, velocity), alone[i].unit)
+            alone[i] = now.updated(row[None], now.unit * error)[0]
+    expected = np.concatenate([moments.place for moments in alone])
+    assert np.ptp(expected[:, 2]) > 0.1
+    np.testing.assert_allclose(state.moments.place[0], expected, rtol=1e-12)
 
 
 # --- the camera ----------------------------------------------------------------------------

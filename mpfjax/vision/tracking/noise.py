@@ -66,16 +66,15 @@ class NoiseState(NamedTuple):
         moments, evidence = Gaussian.none(len(_GRID)), np.zeros((len(_GRID), 4))
         return cls(moments, evidence, np.zeros(4), 0.0, start, Noises(*_PRIOR, speed=start))
 
-    def predicted(self, unit: Float[np.ndarray, "m 4"], frames: float) -> "NoiseState":
-        """Every object under every candidate, later; the units are the objects'."""
+    def predicted(self, frames: float) -> "NoiseState":
+        """Every object under every candidate, later; each candidate has its own units."""
         _, place, velocity = _RIVALS
-        moments = self.moments.predicted(place, velocity, unit[:, None], frames)
+        moments = self.moments.predicted(place, velocity, self.moments.unit, frames)
         return self._replace(moments=moments)
 
     def after(
         self,
         rows: np.ndarray,
-        unit: Float[np.ndarray, "k 4"],
         places: Float[np.ndarray, "k 4"],
         teaches: Bool[np.ndarray, " k"],
         grown: Gaussian,
@@ -91,8 +90,9 @@ class NoiseState(NamedTuple):
 
         `self.moments` are predicted, have moved with the camera, and are written to.
         """
-        unit = unit[:, None]
-        posterior, gap, variance = self.moments.at(rows).updated(places[:, None], unit * _RIVALS[0])
+        predicted = self.moments.at(rows)
+        unit = predicted.unit
+        posterior, gap, variance = predicted.updated(places[:, None], unit * _RIVALS[0])
         self.moments.put(rows, posterior)
         gap, variance, unit = gap[teaches], variance[teaches], unit[teaches]
         tails = 0.5 * (_FREEDOM + 1) * np.log1p(gap**2 / variance / _FREEDOM)

@@ -234,7 +234,7 @@ def advanced(
     known = teaches & counted.confirmed & (counted.seen >= _FIRST)
     grown = objects.at(teaches & (counted.seen == _FIRST))
     speed = noises.speed
-    noise = state.noise.after(rows, before.unit, place, known[rows], grown)
+    noise = state.noise.after(rows, place, known[rows], grown)
     moments = noise.moments.at(stays).joined(noise.begun(places[born], speed))
     unit = units(places[born])
     start = Gaussian.begun(places[born], unit * noises.errors, unit * speed)
@@ -311,9 +311,9 @@ def _carried(
         noise = noise._replace(moments=motion.carried(noise.moments))
         chains = np.concatenate([motion.moved(chains[:, :2]), chains[:, 2:]], axis=1)
     gone = (objects.place - state.objects.place)[:, :2]
-    unit, (_, place, velocity, _) = objects.unit, noise.noises
-    objects, noise = objects.predicted(place, velocity, unit, frames), noise.predicted(unit, frames)
-    return state._replace(objects=objects, noise=noise), gone, chains
+    _, place, velocity, _ = noise.noises
+    objects = objects.predicted(place, velocity, objects.unit, frames)
+    return state._replace(objects=objects, noise=noise.predicted(frames)), gone, chains
 
 
 def _with_camera(
