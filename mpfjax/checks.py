@@ -200,7 +200,8 @@ def _has_numbers(array: Any) -> bool:
 def kinds(tree: Any) -> str:
     """The types and shapes of a tree's arrays, and its structure, to be compared and shown."""
     leaves, structure = jax.tree.flatten(tree)
-    each = [f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}" for leaf in leaves]
+    shapes = map(list, map(jnp.shape, leaves))
+    each = map("{}{}".format, map(jnp.result_type, leaves), shapes)
     is_array = jax.tree_util.treedef_is_leaf(structure)
     return ", ".join(each) + f" in {structure}" * (not is_array)
 

@@ -259,11 +259,11 @@ def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: 
 
 def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> ParticleMixture:
     """The result of a move; a `ValueError` unless it is a mixture of the same shapes and types."""
-    who = f"moves: {name_of(move)} returned"
     if not isinstance(moved, ParticleMixture):
+        who = f"moves: {name_of(move)} returned"
         raise ValueError(f"{who} {shown(moved)}, no ParticleMixture")
     given = kinds((mixture.particles, mixture.log_weights, mixture.component_indicators))
     returned = kinds((moved.particles, moved.log_weights, moved.component_indicators))
     if returned != given:
-        raise ValueError(f"{who} {returned}, and was given {given}")
+        raise ValueError(f"moves: {name_of(move)} returned {returned}, and was given {given}")
     return moved

@@ -1,12 +1,16 @@
 """The particle mixture: one set of joint weights, and all that is derived from it."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
+from operator import attrgetter
 from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int, PyTree, Shaped
 
 from mpfjax.checks import SHARES, as_numbers, checked, saying
@@ -182,14 +186,16 @@ class ParticleMixture(eqx.Module):
         if self.num_components == 1:
             return self.effective_sample_size[None]
         squares, labels = self.component_weights**2, self.component_indicators
-        return _inverse(segment_sum(squares, labels, self.num_components))
+        total = segment_sum(squares, labels, self.num_components)
+        return 1 / jnp.where(total > 0, total, jnp.inf)
 
     @property
     def effective_sample_size(self) -> Float[Array, ""]:
         """(Σ exp ℓ)² / Σ exp 2ℓ over all particles, zero where there is none."""
         self._require_one()
         values, _ = scaled_exp(self.log_weights)
-        return jnp.sum(values) ** 2 * _inverse(jnp.sum(values**2))
+        squares = jnp.sum(values**2)
+        return jnp.sum(values) ** 2 * (1 / jnp.where(squares > 0, squares, jnp.inf))
 
     def component_sums(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, "m *rest"]:
         """Σ_{c_i = m} v_i over each component's slots, in floating point."""
@@ -366,8 +372,8 @@ class ParticleMixture(eqx.Module):
         log_share = (other.log_scale - log_scale) - math.log(num_islands())
         brought = other.replace(log_weights=other.log_weights + log_share).at(rank)
         own = self.replace(log_weights=self.log_weights + (self.log_scale - log_scale))
-        theirs, ours = ({name: getattr(m, name) for name in _OF_SLOTS} for m in (brought, own))
-        slots = select_rows(is_new, theirs, ours)
+        slots = select_rows(is_new, *map(attrgetter(*_OF_SLOTS), (brought, own)))
+        slots = dict(zip(_OF_SLOTS, slots, strict=True))
         return own.replace(**slots, log_scale=log_scale, usable_slots=first + number)
 
     def with_own_ancestors(self) -> "ParticleMixture":
@@ -387,21 +393,20 @@ class ParticleMixture(eqx.Module):
         These are their weights, component indicators and ancestors, and within a step their
         parents. A move that takes particles from other slots than their own takes them so.
         """
-        return self.map_slots(lambda leaf: take(leaf, slots))
+        return self.map_slots(partial(take, indices=slots))
 
     def repeated(self, number: int) -> "ParticleMixture":
         """Each particle so many times, side by side, each time with its whole weight."""
-        return self.map_slots(lambda leaf: jnp.repeat(leaf, number, axis=0))
+        return self.map_slots(partial(jnp.repeat, repeats=number, axis=0))
 
     def map_slots(self, function: Callable[[Array], Array]) -> "ParticleMixture":
         """The mixture after a function of each array that has an entry for each slot."""
-        own = {name: getattr(self, name) for name in _OF_SLOTS}
-        return self.replace(**jax.tree.map(function, own))
+        arrays = jax.tree.map(function, attrgetter(*_OF_SLOTS)(self))
+        return self.replace(**dict(zip(_OF_SLOTS, arrays, strict=True)))
 
     def replace(self, **fields: PyTree) -> "ParticleMixture":
         """A copy with some fields changed."""
-        own = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return type(self)(**own | fields)
+        return dataclasses.replace(self, **fields)
 
     def _require_one(self) -> None:
         shape = self.log_weights.shape
@@ -452,10 +457,8 @@ def points(particles: PyTree) -> PyTree:
 
 def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
     """All leaves of the particles side by side, one row a particle."""
-    leaves = jax.tree.leaves(points(particles))
-    leaves = [as_inexact(leaf.reshape(leaf.shape[0], -1)) for leaf in leaves]
-    widest = max((leaf.dtype for leaf in leaves), key=lambda dtype: jnp.finfo(dtype).bits)
-    return jnp.concatenate([leaf.astype(widest) for leaf in leaves], axis=1)
+    rows = jax.vmap(lambda one: ravel_pytree(one)[0])(points(particles))
+    return as_inexact(rows)
 
 
 def _averages(average: Callable[[Array], Array], values: PyTree, periods: PyTree) -> PyTree:
@@ -478,8 +481,3 @@ def _averages(average: Callable[[Array], Array], values: PyTree, periods: PyTree
 def _numbers(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:
     """The values as an array to be averaged: also from numpy, and in floating point."""
     return jnp.asarray(as_numbers("values", values, floating=True, may_be_complex=True))
-
-
-def _inverse(squares: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
-    """1 / Σ w², zero where there is no weight."""
-    return jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1.0), 0.0)

@@ -149,12 +149,12 @@ def model_name(model: Any) -> str:
 
 
 @contextlib.contextmanager
-def asking(model: Any, method: str, given: str = "") -> Iterator[None]:
+def asking(model: Any, method: str, given: str = "", value: Any = None) -> Iterator[None]:
     """A block that calls a method of the model, whose errors say so, and what it was given."""
     try:
         yield
     except Exception:
-        clauses = [f"given {given}"] if given else []
+        clauses = [f"given {given} {shown(value)}"] if given else []
         is_users = not type(model).__module__.startswith("mpfjax.")
         if getattr(model, "inputs", ()) is None and is_users:
             clauses.append("its inputs None, as the call gives no u_t")

@@ -2,6 +2,7 @@
 
 from typing import Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -165,8 +166,8 @@ def stratified_uniform(key: Key[Array, ""], num_points: int) -> Float[Array, " n
 
 def noise_dtype(states: PyTree) -> jnp.dtype:
     """The type of the noise that moves these states: that of their floating point leaves."""
-    leaves = [leaf for leaf in jax.tree.leaves(states) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    return jnp.result_type(*leaves) if leaves else default_float()
+    leaves = jax.tree.leaves(eqx.filter(states, eqx.is_inexact_array))
+    return jnp.finfo(jnp.result_type(*leaves)).dtype if leaves else default_float()
 
 
 def _multipliers(dimension: int) -> UInt32[Array, " d"]:

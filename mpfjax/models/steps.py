@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import shown
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models import gaussians
 from mpfjax.models.base import asking, check_moved, real_each
@@ -51,7 +50,7 @@ def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
     before = drawn_part(model, states)
     if is_mixed(model):
         return latent_from_noise(model, noise, states)
-    with asking(model, "transition_from_noise", f"noise {noise.shape}, as noise_dimension says"):
+    with asking(model, "transition_from_noise", "of noise_dimension", noise):
         draws = model.transition_from_noise(noise, before)
     check_moved(draws, before, model, "transition_from_noise")
     return draws
@@ -106,8 +105,8 @@ def seen(
 def own_likelihoods(model: Any, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
     """The model's own `log_likelihood`, of a latent without what is seen of x, checked."""
     is_list = isinstance(observation, list)
-    hint = ", one number of each array in a list: jnp.asarray(observations) is one array" * is_list
-    with asking(model, "log_likelihood", f"the observation {shown(observation)}{hint}"):
+    hint = " (one number of each array in a list; jnp.asarray(observations) is one array)" * is_list
+    with asking(model, "log_likelihood", f"the observation{hint}", observation):
         values = model.log_likelihood(observation, states)
     num_particles = jax.tree.leaves(states)[0].shape[0]
     return real_each(values, num_particles, model, "log_likelihood")

@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
+from operator import attrgetter
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
@@ -13,7 +14,6 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.checks import Checked, check, is_series, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.operations.logarithms import without_gradient
 
 Gradient = Literal["none", "stop"]
 
@@ -211,7 +211,7 @@ class AbstractRegrouping(AbstractMove):
         if mixture.num_components == 1 or is_missing(now):
             return mixture
         # Indicators are whole numbers and have no derivative.
-        indicators, memory = self.regroup(key, without_gradient(mixture))
+        indicators, memory = self.regroup(key, jax.lax.stop_gradient(mixture))
         return mixture.replace(component_indicators=indicators, memory=memory)
 
     def around(self, reference: Any) -> "AbstractRegrouping":
@@ -295,7 +295,7 @@ def _of_inner(together: Callable[..., bool], name: str) -> Any:
     """An attribute that is so of any of the moves held, or of all."""
 
     def of_moves(self: AbstractMove) -> bool:
-        return together(getattr(move, name) for move in self.inner)
+        return together(map(attrgetter(name), self.inner))
 
     return property(of_moves, doc=f"Whether it is so of {together.__name__} of the moves held.")
 

@@ -7,6 +7,7 @@ in the memory, gives it at least one offspring. `mpfjax.smoothing.conditional_fi
 this is exact.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -57,7 +58,8 @@ class ConditionalPropagation(AbstractPropagation):
         """Propagate around x*_t, and weigh as the move does."""
         proposal, previous = self.move.proposal, mixture.particles
         if proposal is None or is_missing(now):
-            moved = self._with_reference(self.move.predicted(key, mixture, now))
+            unseen = dataclasses.replace(now, observation=None)
+            moved = self._with_reference(self.move(key, mixture, unseen))
             return moved if is_missing(now) else self.move.weighed(moved, now)
         states, log_density = proposal.propose(key, now, previous)
         moved = self._with_reference(mixture.replace(particles=states))

@@ -59,9 +59,7 @@ def with_offspring(
     num_drawn: Int[Array, " m"],
     due: Bool[Array, " m"],
 ) -> ParticleMixture:
-    """The resampled mixture with the Eve indices of its particles, if it keeps them."""
-    if EVE_INDICES not in before.memory:
-        return resampled
+    """The resampled mixture with the Eve indices of its particles."""
     eve: EveIndices = before.memory[EVE_INDICES]
     log_factors, groups = eve.log_pair_factors, eve.groups
     if before.num_components > 1:

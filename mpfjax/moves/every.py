@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Key, PyTree
+from jaxtyping import Array, Bool, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
@@ -60,7 +60,8 @@ class Every(AbstractWrapper):
 
     def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
         """Which components of `mixture` the moves would resample now."""
-        return super().would_resample(mixture, now) & self._runs(mixture)
+        runs = mixture.memory[self.name]["steps"] == self.num_steps - 1
+        return super().would_resample(mixture, now) & runs
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
@@ -68,9 +69,9 @@ class Every(AbstractWrapper):
         """Run the moves if this is a k-th step; none where y_t is missing."""
         if is_missing(now):
             return mixture
-        runs, steps = self._runs(mixture), self._steps(mixture) + 1
+        steps = mixture.memory[self.name]["steps"] + 1
         counted = mixture.memory | {self.name: {"steps": steps % self.num_steps}}
-        mixture = mixture.replace(memory=counted)
+        mixture, runs = mixture.replace(memory=counted), steps == self.num_steps
 
         def run() -> ParticleMixture:
             moved: Any = mixture
@@ -90,9 +91,3 @@ class Every(AbstractWrapper):
             runs, regroup, lambda: (mixture.component_indicators, mixture.memory)
         )
         return mixture.replace(component_indicators=indicators, memory=memory)
-
-    def _steps(self, mixture: ParticleMixture) -> Int[Array, ""]:
-        return mixture.memory[self.name]["steps"]
-
-    def _runs(self, mixture: ParticleMixture) -> Bool[Array, ""]:
-        return self._steps(mixture) == self.num_steps - 1

@@ -99,7 +99,8 @@ def finite_max(log_values: Float[Array, " n"]) -> Float[Array, ""]:
 
     A derivative treats it as a constant.
     """
-    return finite_or_zero(largest(log_values))
+    most = largest(log_values)
+    return jnp.where(jnp.isfinite(most), most, 0.0)
 
 
 def log_sum_exp(log_values: Float[Array, " n"]) -> Float[Array, ""]:

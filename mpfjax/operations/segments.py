@@ -65,7 +65,7 @@ def spread(
     shape = (*segments.shape, *values.shape[1:])
     if num_segments == 1:
         return jnp.broadcast_to(values, shape)
-    cases = [jnp.broadcast_to(value, shape) for value in jnp.split(values, num_segments)]
+    cases = map(partial(jnp.broadcast_to, shape=shape), jnp.split(values, num_segments))
     which = jax.lax.broadcast_in_dim(segments.astype(jnp.int32), shape, (0,))
     return jax.lax.select_n(which, *cases)
 

@@ -64,5 +64,5 @@ class Exclusion(AbstractExclusion, ByFeatures):
         total = jnp.zeros(mixture.num_particles, features.dtype)
         for m in range(mixture.num_components):
             square = jnp.sum((features - groups.means[m][None]) ** 2, axis=1)
-            total += jnp.where((own != m) & groups.alive[m], self.nearness(square), 0.0)
+            total += jnp.where((own != m) & (groups.masses[m] > 0), self.nearness(square), 0.0)
         return mixture.weighed(-self.strength * total)

@@ -68,13 +68,13 @@ class _Propagation(AbstractPropagation):
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t; without it, by the model's own law."""
         if is_missing(now):
-            return self.predicted(key, mixture, now)
+            return predict(key, now.model, mixture, self.gradient, self.noise)
         if self.noise != "independent":
             dimension = self.noise_dimension(mixture, now)
             noise = noise_of_slots(self.noise, key, dimension, mixture)
             return self.from_noise(noise, mixture, now)
         if self.proposal is None:
-            return self.weighed(self.predicted(key, mixture, now), now)
+            return self.weighed(predict(key, now.model, mixture, self.gradient), now)
         return self._proposed(self.proposal.propose(key, now, mixture.particles), mixture, now)
 
     def from_noise(
@@ -96,12 +96,6 @@ class _Propagation(AbstractPropagation):
             return noise_dimension(now.model, mixture.particles)
         return proposal.noise_dimension(mixture.particles)
 
-    def predicted(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step
-    ) -> ParticleMixture:
-        """Draws of x_t ~ D(. | x_{t-1}), with the weights of x_{t-1}."""
-        return predict(key, now.model, mixture, self.gradient, self.noise)
-
     def _proposed(
         self, proposed: tuple[PyTree, Float[Array, " n"]], mixture: ParticleMixture, now: Step
     ) -> ParticleMixture:
@@ -121,18 +115,13 @@ class _Propagation(AbstractPropagation):
         log_density: Float[Array, " n"] | None = None,
     ) -> ParticleMixture:
         """The weights of x_t times L, and D / q where each has been drawn with a log q."""
-        draws = drawn_part(now.model, mixture.particles)
-        mixture, log_factors = self._likelihoods(mixture, now)
+        states, log_factors = mixture.particles, []
+        if self.weighs:
+            states, log_factors = seen(now.model, now.observation, states)
         if log_density is not None:
+            draws = drawn_part(now.model, mixture.particles)
             log_factors.append(log_transition(now.model, draws, previous) - log_density)
-        return mixture.weighed(*log_factors)
-
-    def _likelihoods(
-        self, mixture: ParticleMixture, now: Step
-    ) -> tuple[ParticleMixture, list[Array]]:
-        """The particles updated by y_t, and log L as its factors."""
-        states, log_factors = seen(now.model, now.observation, mixture.particles)
-        return mixture.replace(particles=states), log_factors
+        return mixture.replace(particles=states).weighed(*log_factors)
 
     def around(self, reference: Reference) -> ConditionalPropagation:
         """The same around the trajectory, where noise and proposal allow it."""
@@ -208,13 +197,6 @@ class Predict(_Propagation):
 
     weighs = False
     """the likelihood of the observation changes no weight."""
-
-    def _likelihoods(
-        self, mixture: ParticleMixture, now: Step
-    ) -> tuple[ParticleMixture, list[Array]]:
-        """The particles as they are, and nothing of L."""
-        del now
-        return mixture, []
 
 
 class Reweight(AbstractPropagation):

@@ -1,12 +1,13 @@
 """The features of the state that regrouping uses, and their units."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from mpfjax.checks import POSITIVE, Checked, check_shape, saying, to_numbers
 from mpfjax.mixture import ParticleMixture, flatten_states
@@ -97,11 +98,6 @@ class Groups(eqx.Module):
     means: Float[Array, "g k"]
     covariances: Float[Array, "g k k"]
 
-    @property
-    def alive(self) -> Bool[Array, " g"]:
-        """Which groups hold mass."""
-        return self.masses > 0
-
 
 def relative_weights(mixture: ParticleMixture) -> Float[Array, " n"]:
     """The weights within each component, in units of its largest; a dead one's are zero."""
@@ -167,7 +163,7 @@ def _first_moments(
 ) -> Float[Array, "c n"]:
     """The weights, and the weighted features, column by column."""
     weights = weights.astype(features.dtype)
-    return jnp.stack([weights, *(weights * column for column in features.T)])
+    return jnp.stack([weights, *map(partial(jnp.multiply, weights), features.T)])
 
 
 def _products(

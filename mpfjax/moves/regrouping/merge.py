@@ -59,7 +59,19 @@ class Merge(AbstractRegrouping, ByFeatures):
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The lowest label of the chain of overlapping components that each particle is in."""
         del key
-        overlap, memory = self._overlap(mixture), mixture.memory
+        components, features = mixture.component_indicators, self.features_of(mixture)
+        weights = relative_weights(mixture)
+        groups = summarise(features, weights, components, mixture.num_components)
+        means, covariances = groups.means, groups.covariances
+        distance, deviations = separation(
+            means[:, None] - means[None], (covariances[:, None] + covariances[None]) / 2
+        )
+        alive = groups.masses > 0
+        overlap, memory = alive[:, None] & alive[None], mixture.memory
+        if self.max_deviations is not None:
+            overlap &= deviations < self.max_deviations
+        if self.max_distance is not None:
+            overlap &= distance < self.max_distance
         if self.patience == 1:
             labels = lowest_connected(overlap)
         else:
@@ -69,21 +81,7 @@ class Merge(AbstractRegrouping, ByFeatures):
             is_free = labels != jnp.arange(mixture.num_components, dtype=labels.dtype)
             durations = jnp.where(is_free[:, None] | is_free[None], 0, durations)
             memory = memory | {"overlap_durations": durations}
-        return spread(labels, mixture.component_indicators), memory
-
-    def _overlap(self, mixture: ParticleMixture) -> Bool[Array, "m m"]:
-        weights, labels = relative_weights(mixture), mixture.component_indicators
-        groups = summarise(self.features_of(mixture), weights, labels, mixture.num_components)
-        means, covariances = groups.means, groups.covariances
-        distance, deviations = separation(
-            means[:, None] - means[None], (covariances[:, None] + covariances[None]) / 2
-        )
-        overlap = groups.alive[:, None] & groups.alive[None]
-        if self.max_deviations is not None:
-            overlap &= deviations < self.max_deviations
-        if self.max_distance is not None:
-            overlap &= distance < self.max_distance
-        return overlap
+        return spread(labels, components), memory
 
 
 def lowest_connected(adjacent: Bool[Array, "m m"]) -> Int[Array, " m"]:

@@ -12,7 +12,7 @@ from mpfjax.checks import Count, Share, one_of
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractResampling, Gradient, Step
 from mpfjax.moves.conditional import REFERENCE
-from mpfjax.moves.eve_indices import with_offspring
+from mpfjax.moves.eve_indices import EVE_INDICES, with_offspring
 from mpfjax.moves.resampling.allocation import (
     allocate_slots,
     demands_by_variance,
@@ -173,7 +173,9 @@ class Resample(AbstractResampling):
         if reference is not None:
             kept = {REFERENCE: reference | {"slot": ancestors.kept}}
             redrawn = redrawn.replace(memory=mixture.memory | kept)
-        return with_offspring(redrawn, mixture, parents, targets, due), ancestors
+        if EVE_INDICES in mixture.memory:
+            redrawn = with_offspring(redrawn, mixture, parents, targets, due)
+        return redrawn, ancestors
 
     def deal(
         self, mixture: ParticleMixture, line: Line, due: Bool[Array, " m"]
