@@ -457,7 +457,9 @@ def points(particles: PyTree) -> PyTree:
 
 def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
     """All leaves of the particles side by side, one row a particle."""
-    rows = jax.vmap(lambda one: ravel_pytree(one)[0])(points(particles))
+    # Whole numbers beside others, in the type of these.
+    with jax.numpy_dtype_promotion("standard"):
+        rows = jax.vmap(lambda one: ravel_pytree(one)[0])(points(particles))
     return as_inexact(rows)
 
 

@@ -549,7 +549,7 @@ MISTAKEN = (
         mpfjax.mixture_particle_filter(MODEL, 20, 2, features=lambda states: (states, states)))),
     (r"features, line \d+ of test_refusals.py, .*: .* has no attribute.* place",
      lambda: run(mpfjax.mixture_particle_filter(MODEL, 20, 2, features=lambda x: x.place))),
-    (r"model: QuadraticModel.log_likelihood, given .* in a list: jnp.asarray\(observations\) is",
+    (r"model: QuadraticModel.log_likelihood, given .* in a list; jnp.asarray\(observations\) is",
      lambda: run(FILTER, [TWO, TWO, TWO])),
     (r"model: LinearGaussianModel.log_likelihood, .*: observation: shape \(2,\) is not \(1\)",
      lambda: run_of(mpfjax.LinearGaussianModel(**LINEAR), np.ones((3, 2)))),
