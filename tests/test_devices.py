@@ -189,6 +189,8 @@ class TestIslands:
         for constant in map(np.float32, (1e3, -1e30)):
             with_it, without = run(constant, np.float32(0)), run(constant, constant)
             assert float(with_it.final.weights.sum()) == pytest.approx(1, rel=1e-5)
+            size = with_it.effective_sample_size[-1]
+            np.testing.assert_allclose(size, with_it.final.effective_sample_size, rtol=1e-4)
             np.testing.assert_allclose(with_it.final.weights, without.final.weights, atol=1e-7)
             increments = without.log_likelihood_increments + constant
             np.testing.assert_allclose(with_it.log_likelihood_increments, increments, rtol=1e-6)

@@ -36,6 +36,8 @@ class FilterRun(eqx.Module):
     """which components each step resampled."""
     degenerate: Bool[Array, " t"]
     """the steps at which every particle had zero likelihood."""
+    effective_sample_size: Float[Array, " t"]
+    """(Σ W)² / Σ W² of the weights W of all particles after each step."""
     log_evidence_against_start: Float[Array, " t"] | None = None
     """that of each step's `StepInfo`, and None unless a move of the filter tells it."""
     surprised: Bool[Array, " t"] | None = None
@@ -109,7 +111,16 @@ def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> P
     return mixture.replace(log_scale=mixture.log_scale - log_islands)
 
 
-_KEPT = ("resampled", "degenerate", "log_evidence_against_start", "surprised")
+_KEPT = (
+    "resampled",
+    "degenerate",
+    "effective_sample_size",
+    "log_evidence_against_start",
+    "surprised",
+)
+_NEARLY_ALL = 0.9
+_FEWEST_TOLD = 8
+"""Fewer particles cannot have an effective number that tells anything."""
 Report = dict[str, PyTree]
 """What a run keeps of a step's report, or of those of all steps."""
 
@@ -153,8 +164,8 @@ def step_or_predict(
 def sound(run: FilterRun) -> FilterRun:
     """The run, or an error where a density of the model was NaN or infinite.
 
-    A RuntimeWarning, one for all runs, where no step of a run had any likelihood, and another where
-    at the end all hypotheses seem wrong.
+    A RuntimeWarning, one for all runs, where no step of a run had any likelihood, where one
+    particle had all weight in nearly all steps, and where at the end all hypotheses seem wrong.
     """
     increments = run.log_likelihood_increments
     if isinstance(increments, Tracer):
@@ -165,16 +176,29 @@ def sound(run: FilterRun) -> FilterRun:
     degenerate = np.asarray(run.degenerate)
     is_blind = degenerate.any(axis=-1) & (degenerate | (np.asarray(increments) == 0)).all(axis=-1)
     if is_blind.any():
-        which = f" in {is_blind.sum()} of {is_blind.size} runs" if is_blind.ndim else ""
+        which = _in_how_many(is_blind)
         said = f"every step with an observation was degenerate{which}: no particle had any"
         said += " likelihood; mpfjax.check_model tries a model out"
         warn(said)
+    weighed = (np.asarray(increments) != 0) & ~degenerate
+    num_weighed, is_alone = weighed.sum(axis=-1), np.asarray(run.effective_sample_size) < 2
+    num_alone = (weighed & is_alone).sum(axis=-1)
+    is_poor = (num_weighed > 0) & (num_alone >= _NEARLY_ALL * num_weighed)
+    if is_poor.any() and run.final.log_weights.shape[-1] >= _FEWEST_TOLD:
+        said = "one particle had nearly all weight in nearly all steps with an observation"
+        said += f"{_in_how_many(is_poor)}: run.effective_sample_size is below 2. Are y and the"
+        warn(f"{said} model in the same units, and is its observation noise not too small?")
     if run.surprised is not None and np.any(run.surprised[..., -1]):
         surprised = np.asarray(run.surprised)
         is_lost = surprised[..., -1]
-        which = f" in {is_lost.sum()} of {is_lost.size} runs" if is_lost.ndim else ""
+        which = _in_how_many(is_lost)
         first = int(np.argmax(surprised.reshape(-1, surprised.shape[-1]).any(axis=0)))
         said = f"at the end, what was observed speaks against all hypotheses{which}, first at index"
         said += f" {first} of the steps: run.surprised; mpfjax.with_restarts lets the state begin"
         warn(f"{said} anew")
     return run
+
+
+def _in_how_many(which: np.ndarray | np.bool_) -> str:
+    """In how many of several runs, and nothing for one run."""
+    return f" in {which.sum()} of {which.size} runs" if which.ndim else ""

@@ -327,3 +327,20 @@ def test_a_run_without_any_likelihood_says_so_once(recwarn):
     with pytest.warns(RuntimeWarning, match="degenerate in 3 of 3 runs") as found:
         mpfjax.monte_carlo(keys, filter, far, missing="skip")
     assert [each.filename for each in found] == [__file__]  # the line that ran it
+
+
+def test_a_run_in_which_one_particle_has_all_weight_says_so_once(recwarn):
+    """As where the observations are in other units than the model."""
+    keys, seen = jax.random.split(jax.random.key(0), 3), np.array([0.4, np.nan, 0.9, 0.1])
+    filter = mpfjax.particle_filter(Drift(), 20)
+    run = mpfjax.run_filter(keys[0], filter, seen, missing="skip")
+    sizes = jax.vmap(lambda mixture: mixture.effective_sample_size)(run.collected)
+    np.testing.assert_allclose(run.effective_sample_size, sizes, rtol=1e-5)
+    few = mpfjax.particle_filter(Drift(), 4)
+    mpfjax.run_filter(keys[0], few, 1000 * seen, missing="skip")
+    assert not recwarn.list
+    said = "one particle had nearly all weight in nearly all steps with an observation"
+    with pytest.warns(RuntimeWarning, match=f"{said}: .*units"):
+        mpfjax.run_filter(keys[0], filter, 1000 * seen, missing="skip")
+    with pytest.warns(RuntimeWarning, match=f"{said} in 3 of 3 runs"):
+        mpfjax.monte_carlo(keys, filter, 1000 * seen, missing="skip")
