@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.alarm import is_alarmed
 from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
-from mpfjax.operations.islands import num_islands, over_islands
+from mpfjax.operations.islands import num_islands
 
 
 class StepInfo(eqx.Module):
@@ -19,7 +19,7 @@ class StepInfo(eqx.Module):
     effective_sample_sizes: Float[Array, " m"]
     """of each component of the new mixture, zero for a dead one."""
     effective_sample_size: Float[Array, ""]
-    """of the whole new mixture, of all islands."""
+    """1 / Σ exp 2ℓ, of the whole new mixture."""
     mixture_weights: Float[Array, " m"]
     """the mass of each component of the new mixture."""
     resampled: Bool[Array, " m"]
@@ -56,12 +56,14 @@ def report_of(
         variance = jnp.where(degenerate, jnp.inf, evidence_variance(mixture))
         of_evidence = jnp.sqrt(jnp.maximum(variance, 0.0))
         of_masses = jnp.sqrt(jnp.maximum(mass_variances(mixture), 0.0))
-    sizes, masses = mixture.component_effective_sample_sizes, mixture.mixture_weights
+    # It is a diagnosis: the gradient of a run need not go through it at every step.
+    squares = jnp.sum(jnp.exp(2 * jax.lax.stop_gradient(mixture.log_weights)))
+    sizes = mixture.component_effective_sample_sizes
     return StepInfo(
         log_likelihood_increment=increment,
         effective_sample_sizes=sizes,
-        effective_sample_size=_effective_size(masses, sizes),
-        mixture_weights=masses,
+        effective_sample_size=1 / squares,
+        mixture_weights=mixture.mixture_weights,
         resampled=resampled,
         degenerate=degenerate,
         labels_ran_out=jnp.all(sizes > 0) & (mixture.num_components > 1),
@@ -70,12 +72,3 @@ def report_of(
         log_evidence_against_start=evidence_against,
         surprised=None if evidence_against is None else is_alarmed(mixture),
     )
-
-
-def _effective_size(masses: Float[Array, " m"], sizes: Float[Array, " m"]) -> Float[Array, ""]:
-    """1 / Σ exp 2ℓ over all particles of all islands, from the masses and sizes of components."""
-    squares = jnp.sum(jnp.where(sizes > 0, masses**2 / jnp.where(sizes > 0, sizes, 1.0), 0.0))
-    if num_islands() > 1:
-        squares = jnp.sum(over_islands(squares))
-    # It is a diagnosis: the gradient of a run need not go through it at every step.
-    return jax.lax.stop_gradient(1 / squares)

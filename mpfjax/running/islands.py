@@ -116,6 +116,7 @@ def _joined(run: FilterRun, whole: bool) -> FilterRun:
         initial=_whole_mixture(run.initial),
         final=_whole_mixture(run.final),
         resampled=resampled.reshape(resampled.shape[0], -1),
+        effective_sample_size=1 / jnp.sum(1 / run.effective_sample_size, axis=0),
     )
 
 

@@ -118,9 +118,8 @@ _KEPT = (
     "log_evidence_against_start",
     "surprised",
 )
-_NEARLY_ALL = 0.9
-_FEWEST_TOLD = 8
-"""Fewer particles cannot have an effective number that tells anything."""
+# The effective number of fewer particles tells nothing.
+_NEARLY_ALL, _FEWEST_TOLD = 0.9, 8
 Report = dict[str, PyTree]
 """What a run keeps of a step's report, or of those of all steps."""
 
@@ -161,11 +160,12 @@ def step_or_predict(
     )
 
 
-def sound(run: FilterRun) -> FilterRun:
+def sound(run: FilterRun, free: bool = True) -> FilterRun:
     """The run, or an error where a density of the model was NaN or infinite.
 
     A RuntimeWarning, one for all runs, where no step of a run had any likelihood, where one
-    particle had all weight in nearly all steps, and where at the end all hypotheses seem wrong.
+    particle had all weight in nearly all steps of a `free` run, which keeps no given trajectory,
+    and where at the end all hypotheses seem wrong.
     """
     increments = run.log_likelihood_increments
     if isinstance(increments, Tracer):
@@ -182,10 +182,10 @@ def sound(run: FilterRun) -> FilterRun:
         warn(said)
     weighed = (np.asarray(increments) != 0) & ~degenerate
     num_weighed, is_alone = weighed.sum(axis=-1), np.asarray(run.effective_sample_size) < 2
-    num_alone = (weighed & is_alone).sum(axis=-1)
-    is_poor = (num_weighed > 0) & (num_alone >= _NEARLY_ALL * num_weighed)
+    is_poor = (weighed & is_alone).sum(axis=-1) >= np.maximum(_NEARLY_ALL * num_weighed, 2)
     # Wrong units show in most runs; a few that lost the state tell nothing of the model.
-    if is_poor.mean() > 0.5 and run.final.log_weights.shape[-1] >= _FEWEST_TOLD:
+    filled = run.initial.log_weights > -np.inf
+    if free and is_poor.mean() > 0.5 and np.asarray(filled).sum(axis=-1).min() >= _FEWEST_TOLD:
         said = "one particle had nearly all weight in nearly all steps with an observation"
         said += f"{_in_how_many(is_poor)}: run.effective_sample_size is below 2. Are y and the"
         warn(f"{said} model in the same units, and is its observation noise not too small?")

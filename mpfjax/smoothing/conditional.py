@@ -95,7 +95,7 @@ def conditional_filter(
     _require(eqx.filter_jit(possible_times)(filter.model, trajectory, series.inputs))
     run = lambda filter: _run(key, filter, series, trajectory, backward)  # noqa: E731
     found = with_floats_traced(run, filter)
-    found = eqx.tree_at(lambda found: found.run, found, sound(found.run))
+    found = eqx.tree_at(lambda found: found.run, found, sound(found.run, free=False))
     if isinstance(found.possible, Tracer):
         return eqx.error_if(found, ~jnp.all(found.possible), _IMPOSSIBLE)
     _require(found.possible)
