@@ -13,7 +13,7 @@ from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, replaced, with_inputs
 from mpfjax.models.noise import Noise
 from mpfjax.models.observations import Fault, faults_of, one_input, one_observation, raise_faults
-from mpfjax.moves.alarm import hearing
+from mpfjax.moves.alarm import SURPRISE, hearing
 from mpfjax.moves.base import (
     AbstractMove,
     AbstractPropagation,
@@ -27,7 +27,7 @@ from mpfjax.moves.base import (
 )
 from mpfjax.moves.initial import sample_initial
 from mpfjax.operations.compiling import jit_with_floats_traced
-from mpfjax.operations.random import split, split_keys
+from mpfjax.operations.random import split
 from mpfjax.operations.stored import drawn_once
 from mpfjax.report import StepInfo, report_of
 
@@ -189,7 +189,7 @@ class Filter(eqx.Module):
         self, key: Key[Array, "*keys"], observation: PyTree = None, particles: PyTree = None
     ) -> ParticleMixture:
         """x_0, of these particles if they are there."""
-        key_drawn, *keys = split_keys(key, 1 + len(self.initial_moves))
+        key_drawn, *keys = split(key, 1 + len(self.initial_moves))
         if particles is None:
             draw = self._sample_initial
             particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
@@ -210,7 +210,7 @@ class Filter(eqx.Module):
         now, mixture = self._now(observation), mixture.with_own_ancestors()
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
-        for move_key, move in zip(split_keys(key, len(self.moves)), self.moves, strict=True):
+        for move_key, move in zip(split(key, len(self.moves)), self.moves, strict=True):
             if self._keeps_parents and isinstance(move, AbstractPropagation):
                 mixture = mixture.with_parents()
             moved = check_result(move(move_key, mixture, now), mixture, move)
@@ -221,7 +221,9 @@ class Filter(eqx.Module):
                     increment += log_growth
             mixture = moved
         mixture = mixture.replace(parents=None, in_order=False)
-        mixture, evidence = hearing(self.moves, mixture, now, increment)
+        evidence = None
+        if SURPRISE in mixture.memory:
+            mixture, evidence = hearing(self.moves, mixture, now, increment)
         return mixture, report_of(mixture, increment, resampled, evidence)
 
     def _step_and_faults(

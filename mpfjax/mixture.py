@@ -21,9 +21,9 @@ from mpfjax.operations.logarithms import (
     exp,
     finite_max,
     finite_or_zero,
+    log_or_nothing,
     log_sum_exp,
     scaled_exp,
-    scaled_log_sum_exp,
     softmax,
 )
 from mpfjax.operations.prefix_sums import sum_before
@@ -340,7 +340,8 @@ class ParticleMixture(eqx.Module):
         """
         # The scale is removed first, which is exact. If it were added to the logarithm of the sum,
         # that would be lost to rounding.
-        log_sum, log_largest = scaled_log_sum_exp(self.log_weights)
+        values, log_largest = scaled_exp(self.log_weights)
+        log_sum = log_or_nothing(jnp.sum(values))
         log_excess, log_total, log_scale = excess_over_islands(self.log_scale, log_largest, log_sum)
         has_mass = log_total > -jnp.inf
         log_share = log_excess - jnp.where(has_mass, log_total, 0.0)

@@ -32,7 +32,7 @@ def hearing(
     The sum is bounded, so that it ends soon after the hypotheses are right again, and so is what
     one step can tell: an impossible one is not for ever.
     """
-    for move in moves if SURPRISE in mixture.memory else ():
+    for move in moves:
         evidence = move.evidence_against(mixture, now, increment)
         if evidence is not None:
             told = jnp.where(jnp.isnan(evidence), 0.0, evidence)

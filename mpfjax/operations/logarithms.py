@@ -105,20 +105,8 @@ def finite_max(log_values: Float[Array, " n"]) -> Float[Array, ""]:
 
 def log_sum_exp(log_values: Float[Array, " n"]) -> Float[Array, ""]:
     """log Σ exp, -inf where every entry is -inf, with a gradient that is finite there too."""
-    log_total, log_scale = scaled_log_sum_exp(log_values)
-    return log_total + log_scale
-
-
-def scaled_log_sum_exp(
-    log_values: Float[Array, " n"],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """log Σ exp in two parts: the largest, and log Σ exp of the values minus the largest.
-
-    If the largest is beyond a million, the sum of both parts would lose the smaller one to
-    rounding.
-    """
     values, log_scale = scaled_exp(log_values)
-    return log_or_nothing(jnp.sum(values)), log_scale
+    return log_or_nothing(jnp.sum(values)) + log_scale
 
 
 def softmax(log_values: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -87,8 +87,13 @@ def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
     return jax.random.wrap_key_data(jax.random.key_data(key), impl=_UNROLLED)
 
 
-def split(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
-    """`jax.random.split`, the same ordinary keys in less time on a CPU."""
+def split(key: Key[Array, "*keys"], num: int) -> Key[Array, " num"]:
+    """`jax.random.split`, the same ordinary keys in less time on a CPU; keys that are split stay.
+
+    A longer split starts with the same keys.
+    """
+    if key.ndim:
+        return key
     keys = jax.random.split(fast_key(key), num)
     return jax.random.wrap_key_data(jax.random.key_data(keys), impl=jax.random.key_impl(key))
 
@@ -103,11 +108,6 @@ def split_once(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
     keys = split(key, num)
     words = stored(jax.random.key_data(keys))
     return jax.random.wrap_key_data(words, impl=jax.random.key_impl(keys))
-
-
-def split_keys(key: Key[Array, "*keys"], num: int) -> list[Key[Array, ""]]:
-    """A key for each move, or those that `key` holds. Longer chains start with the same keys."""
-    return list(key if key.ndim else split(key, num))
 
 
 def split_for_run(

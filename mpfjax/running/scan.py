@@ -17,7 +17,7 @@ from mpfjax.filter import BROKEN_DENSITY, Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import Series
 from mpfjax.operations.islands import num_islands
-from mpfjax.operations.random import split, split_for_run, split_keys
+from mpfjax.operations.random import split, split_for_run
 from mpfjax.report import StepInfo
 
 
@@ -86,7 +86,7 @@ def takes_time(collect: Any) -> bool:
 
 def initial_keys(key: Key[Array, ""], filter: Filter) -> Key[Array, " i"]:
     """The keys with which a run with this key draws and moves x_0."""
-    return split(split_keys(key, 2)[0], 1 + len(filter.initial_moves))
+    return split(split(key, 2)[0], 1 + len(filter.initial_moves))
 
 
 def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> ParticleMixture:

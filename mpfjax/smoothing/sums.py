@@ -21,7 +21,7 @@ from mpfjax.operations.compiling import (
     with_floats_traced,
 )
 from mpfjax.operations.logarithms import as_inexact
-from mpfjax.operations.random import split, split_keys
+from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
 from mpfjax.report import StepInfo
 from mpfjax.running.scan import (
@@ -99,7 +99,7 @@ def smoothed_sums(
 @jit_on_wide_vectors
 def _smooth(key, smoother, series, lag):
     # The first two are those of `run_filter`.
-    key_initial, key_steps, key_backward = split_keys(key, 3)
+    key_initial, key_steps, key_backward = split(key, 3)
     length, filter, num_kept = series.length, smoother.filter, smoother.lag + 1
     step_keys = jax.random.split(key_steps, length)
     initial = first_mixture(key_initial, filter, series)

@@ -18,7 +18,7 @@ from mpfjax.models.base import (
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
 from mpfjax.models.observations import as_arrays, gathered, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.operations.random import split_keys
+from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing.backward import draw, draw_ends, draw_exactly, log_kernel_from, walk
@@ -116,7 +116,7 @@ def draw_trajectories(
 
     `inputs` are those of the steps between mixtures; `checked` as for `draw_exactly`.
     """
-    key_final, key_steps, key_proposed = split_keys(key, 3)
+    key_final, key_steps, key_proposed = split(key, 3)
     last, states = draw_ends(key_final, mixtures, num_trajectories, component)
 
     def back(carry: tuple[PyTree, Array], step: Any) -> tuple[tuple[PyTree, Array], PyTree]:

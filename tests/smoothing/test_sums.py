@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.operations.random import split_keys
+from mpfjax.operations.random import split
 from mpfjax.smoothing import FixedLagSmoother, smoothed_sums
 from mpfjax.smoothing.sums import _advanced
 from tests.smoothing.test_trajectories import QUADRATIC, SQUARES
@@ -36,7 +36,7 @@ def test_one_step_at_a_time_is_the_whole_series(method):
     whole = smoothed_sums(key, filter, SQUARES, function, lag=lag, method=method)
     smoother = FixedLagSmoother(filter, function, lag, method)
     window = smoother.init(whole.run.initial)
-    keys = [jax.random.split(own, len(SQUARES)) for own in split_keys(key, 3)[1:]]
+    keys = [jax.random.split(own, len(SQUARES)) for own in split(key, 3)[1:]]
     for step_key, draw_key, seen in zip(*keys, SQUARES, strict=True):
         moved, _ = filter.step(step_key, window.mixture, seen)
         window, estimates = _advanced(smoother, draw_key, window, moved, None)
