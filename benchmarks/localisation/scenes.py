@@ -259,27 +259,73 @@ def wander(model: Ranges, steps: int, rng: np.random.Generator) -> np.ndarray:
     return np.array(poses)
 
 
-# Corners of the robot's way through the room in the middle, in metres; the pillar is at its end.
-_WAY = np.array([
-    (1.0, 1.0), (4.5, 1.0), (4.5, 3.4), (1.2, 3.6), (1.2, 4.9), (2.8, 4.9), (4.6, 4.2), (6.3, 4.9),
-    (7.2, 4.4), (7.3, 2.6), (6.2, 2.6), (6.15, 0.7),
-])  # fmt: skip
+class Rooms(NamedTuple):
+    """Equal rooms side by side, and the robot's way through one of them."""
+
+    size: tuple[int, int]  # of a room in cells of .1 m: width, height
+    walls: tuple[tuple[int, int, int, int], ...]  # first and last row, first and last column
+    across: int
+    up: int
+    home: tuple[int, int]  # where the robot is: column, row
+    corners: tuple[tuple[float, float], ...]  # of its way, in metres
+    pillar: tuple[int, int, int, int] | None = None  # in the robot's room alone
+
+    def wall(self) -> np.ndarray:
+        """The map."""
+        room = np.zeros(self.size[::-1], bool)
+        room[[0, -1]] = room[:, [0, -1]] = True
+        for top, bottom, left, right in self.walls:
+            room[top:bottom, left:right] = True
+        wall = np.tile(room, (self.up, self.across))
+        if self.pillar is not None:
+            top, bottom, left, right = self.pillar
+            down, along = self.home[1] * self.size[1], self.home[0] * self.size[0]
+            wall[down + top : down + bottom, along + left : along + right] = True
+        return wall
+
+    def way(self, steps: int | None) -> np.ndarray:
+        """The poses, .2 m apart; the last `steps` of them."""
+        corners = np.array(self.corners) + 0.1 * np.array(self.size) * self.home
+        lengths = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
+        along = np.arange(0, lengths[-1], 0.2)
+        places = np.stack([np.interp(along, lengths, each) for each in corners.T], axis=1)
+        headings = np.unwrap(np.arctan2(*np.diff(places, axis=0).T[::-1]))
+        return np.column_stack([places[:-1], headings])[-(steps or len(along)) - 1 :]
+
+    def masses(self, states: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Of each room, (..., rooms)."""
+        place = (np.asarray(states)[..., :2] / (0.1 * np.array(self.size))).astype(int)
+        place = place.clip(0, [self.across - 1, self.up - 1])
+        room = place[..., 0] + self.across * place[..., 1]
+        is_in = room[..., None] == np.arange(self.across * self.up)
+        return np.sum(np.asarray(weights)[..., None] * is_in, axis=-2)
 
 
-def office(seed: int, steps: int | None) -> Scene:
-    """Nine rooms of 8 x 6 m that are equal, but for a pillar that is seen at the end."""
-    room = np.zeros((60, 80), bool)
-    room[[0, -1]] = room[:, [0, -1]] = True
-    room[0:38, 55:57] = room[54:59, 18:20] = room[20:28, 12:22] = room[48:59, 34:38] = True
-    wall = np.tile(room, (3, 3))
-    wall[70:75, 146:151] = True
-    corners = _WAY + np.array([8, 6])
-    lengths = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
-    along = np.arange(0, lengths[-1], 0.2)
-    places = np.stack([np.interp(along, lengths, each) for each in corners.T], axis=1)
-    headings = np.unwrap(np.arctan2(*np.diff(places, axis=0).T[::-1]))
-    poses = np.column_stack([places[:-1], headings])[-(steps or len(along)) - 1 :]
-    return drives(with_table(wall, ~wall, 0.1), seed, lambda _: poses)
+ROOMS = {
+    "office": Rooms(
+        (80, 60), ((0, 38, 55, 57), (54, 59, 18, 20), (20, 28, 12, 22), (48, 59, 34, 38)), 3, 3,
+        (1, 1), ((1.0, 1.0), (4.5, 1.0), (4.5, 3.4), (1.2, 3.6), (1.2, 4.9), (2.8, 4.9), (4.6, 4.2),
+                 (6.3, 4.9), (7.2, 4.4), (7.3, 2.6), (6.2, 2.6), (6.15, 0.7)), (10, 15, 66, 71),
+    ),
+    "twelve": Rooms(
+        (50, 70), ((25, 27, 0, 22), (48, 70, 30, 32), (50, 56, 8, 16), (6, 12, 36, 42)), 4, 3,
+        (2, 1), ((1.0, 1.0), (3.0, 1.4), (3.1, 3.4), (1.6, 3.6), (0.4, 4.6), (0.5, 6.2), (2.2, 6.3),
+                 (2.4, 4.2), (4.0, 3.6), (4.1, 2.0)),
+    ),
+    "ten": Rooms(
+        (60, 60), ((0, 24, 30, 32), (36, 38, 18, 60), (46, 52, 26, 34), (10, 14, 8, 12)), 5, 2,
+        (3, 0), ((0.8, 0.6), (2.2, 0.9), (2.4, 2.6), (1.0, 3.0), (1.0, 4.8), (2.0, 5.3), (4.6, 5.4),
+                 (5.2, 4.6), (4.4, 4.2), (1.4, 4.4), (1.4, 3.0), (4.6, 2.6), (4.8, 1.8)),
+        (4, 9, 50, 55),
+    ),
+}  # fmt: skip
+
+
+def rooms(name: str, seed: int, steps: int | None) -> Scene:
+    """Rooms that are equal, but for a pillar that is seen at the end."""
+    wall = ROOMS[name].wall()
+    way = ROOMS[name].way(steps)
+    return drives(with_table(wall, ~wall, 0.1), seed, lambda _: way)
 
 
 def ring(seed: int, steps: int | None) -> Scene:
@@ -294,4 +340,4 @@ def ring(seed: int, steps: int | None) -> Scene:
 SCENES: dict[str, Callable[[int, int | None], Scene]]
 SCENES = {name: partial(building, name) for name in LOGS}
 SCENES |= {"turtlebot": turtlebot} if MAP.is_file() else {}
-SCENES |= {"office": office, "ring": ring}
+SCENES |= {name: partial(rooms, name) for name in ROOMS} | {"ring": ring}

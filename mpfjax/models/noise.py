@@ -65,7 +65,7 @@ def draw_noise(
     if kind == "stratified":
         ranks = _shuffled_ranks(key_second, jnp.arange(n, dtype=jnp.int32)).astype(jnp.uint32)
         points = ranks[:, None] * _multipliers(d)[None] + bits(key_first, (d,))[None]
-        return _normal_of(points, dtype)
+        return normal_of(points, dtype)
     ranks, shifts = _ranks_and_shifts(key_second, shape, components, num_components, shuffle)
     if d == 1:
         points = (ranks.astype(jnp.uint32) * _multipliers(1))[None] + shifts
@@ -73,7 +73,7 @@ def draw_noise(
         directions = scrambled_directions(key_first, d, _num_digits(n))
         points = sobol_points(ranks, directions) ^ shifts
     # Drawn row by row, then transposed: operations on short rows are not vectorised.
-    return stored(_normal_of(points, dtype)).T
+    return stored(normal_of(points, dtype)).T
 
 
 def draw_family_noise(
@@ -107,7 +107,7 @@ def draw_family_noise(
     rest = sobol_points(draws, directions[1:d]) ^ shift_of_draws
     strata = draw.astype(jnp.uint32) * np.uint32((2**32 // num_draws) % 2**32)
     points = jnp.concatenate([jnp.ravel(first[:, None] // num_draws + strata)[None], rest])
-    return stored(_normal_of(points, dtype)).T, _uniform_of(last, dtype)
+    return stored(normal_of(points, dtype)).T, uniform_of(last, dtype)
 
 
 def _ranks_and_shifts(
@@ -143,12 +143,12 @@ def _num_digits(num_ranks: int) -> int:
     return max((num_ranks - 1).bit_length(), 1)
 
 
-def _normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
+def normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
     """Quantiles of the standard normal at points in units of 2^-32."""
-    return normal_quantile(2 * _uniform_of(points, dtype) - 1)
+    return normal_quantile(2 * uniform_of(points, dtype) - 1)
 
 
-def _uniform_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
+def uniform_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
     """Points in units of 2^-32 as numbers in (0, 1)."""
     # The top 23 bits, at the middle of their cells, keep clear of 0 and 1 in float32 as well.
     return ((points >> _UNUSED).astype(dtype) + 0.5) * jnp.array(2.0**-23, dtype)
