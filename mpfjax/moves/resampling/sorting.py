@@ -24,7 +24,7 @@ from mpfjax.operations.stored import (
 _COUNTED_BLOCK = 32
 _MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # eight counts for each particle
 _BITS = 32
-_MOST_DIMENSIONS = 8
+MOST_DIMENSIONS = 8
 
 
 def order_by_segment(
@@ -122,9 +122,9 @@ def bits_per_dimension(dimension: int) -> int:
 
     Raises `ValueError` for more than 8 dimensions: too few bits are left to tell points apart.
     """
-    if not 1 <= dimension <= _MOST_DIMENSIONS:
+    if not 1 <= dimension <= MOST_DIMENSIONS:
         raise ValueError(
-            f"sort_by: {dimension} coordinates are not 1, ..., {_MOST_DIMENSIONS}, the dimensions"
+            f"sort_by: {dimension} coordinates are not 1, ..., {MOST_DIMENSIONS}, the dimensions"
             " that a Hilbert curve has here; give a function that returns fewer numbers, or one,"
             ' also where "hilbert" or noise="rqmc" sorts by the whole state'
         )

@@ -1,225 +1,305 @@
-"""x_t given the first observations: one tempered sampler of x_0 and of the noise of each step."""
+"""x_t given y_1..y_t of few steps: a tempered sampler of x_0 and of the noise of each step.
+
+A particle is a whole path: x_0, or the noise that it is made of, and the noise of each step; where
+a model draws x_t by a key, a key of its own for each step, so that x_t is a function of x_0 and of
+the keys. y_t enters by powers (Del Moral, Doucet and Jasra 2006). After each, paths are resampled
+and moved by Metropolis steps (resample-move, Gilks and Berzuini 2001; Chopin 2002) for the target
+p(x_0) Π_{s<t} L(y_s | x_s) L(y_t | x_t)^power. Another x_0 is proposed with the noise kept, so that
+the whole path follows, or noise of one step with x_0 kept. A pilot of paths with draws of its own,
+moved along with them, decides the powers and lends the steps of x_0, so that Ẑ is unbiased.
+"""
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 
+from mpfjax.checks import shown
 from mpfjax.mixture import flatten_states, single_component
-from mpfjax.models.base import is_made_of_noise, with_inputs
-from mpfjax.models.conditionally_linear import is_mixed, with_moments
+from mpfjax.models.base import is_made_of_noise, takes_inputs, with_inputs
+from mpfjax.models.conditionally_linear import is_marginalised, is_mixed, with_moments
 from mpfjax.models.noise import noise_dtype, normal_of, uniform_of
 from mpfjax.models.steps import completed, drawn, made_of, noise_dimension, seen
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import HILBERT, in_line
-from mpfjax.operations.logarithms import default_float, exp, finite_max, log_sum_exp
-from mpfjax.operations.random import normal, split
+from mpfjax.moves.resampling.sorting import MOST_DIMENSIONS
+from mpfjax.operations.logarithms import (
+    add_gradient,
+    default_float,
+    exp,
+    finite_max,
+    log_sum_exp,
+    without_gradient,
+)
+from mpfjax.operations.random import bits, normal, split
+from mpfjax.operations.rows import select_rows
 from mpfjax.operations.stored import take
 
-# The part of the pilot that stays effective from one power to the next.
-LEAST_PART = 0.8
-# Moves of each particle after a power of y_t, over t: those of the first ones are cheap.
+# Paths of the pilot for each of the cloud.
+PILOT = 1 / 5
+# The part of the pilot that stays effective from one power to the next, and the most powers of one
+# observation, of which the last is 1 in any case.
+LEAST_PART, MOST_POWERS = 0.8, 64
+# Moves after each power of y_t, over t: the first ones are cheap.
 MOVES = (12, 8, 6, 3, 2, 1)
-NOISE, WALK, NEIGHBOURS = 0.15, 0.4, 0.57
-TURN = 0.7
-LEAST_SIZE = 2.0**-8
-MOST_POWERS = 60
+# Shares of the moves: of noise, and of walks, the others being differences of two of the pilot.
+OF_NOISE, OF_WALKS = 0.15, 0.3
+# What a move leaves of the noise of a step, and the least part of a deviation of x_0 in a walk.
+KEPT_NOISE, LEAST_SIZE = 0.7, 2.0**-8
 
 
 class Window(NamedTuple):
-    """The first L steps: what is seen, what is known beside it, and which observations are there."""
+    """Some steps: what is observed and known beside it, and which observations are there."""
 
     observations: PyTree
     inputs: PyTree
     present: Bool[Array, " steps"]
 
+    def at(self, s: Int[Array, ""]) -> "Window":
+        """One step."""
+        return jax.tree.map(lambda leaf: jax.lax.dynamic_index_in_dim(leaf, s, 0, False), self)
+
 
 class Paths(NamedTuple):
-    """x_0 and the noise of each step, or what they are made of, and what follows from them."""
+    """x_0 and the noise of each step, and what follows: x_t, log L(y_1..y_{t-1}), log L(y_t)."""
 
     places: PyTree  # x_0, or the noise that it is made of
-    noise: Array  # (n, L, k), normal; or the words of keys, (n, L, 2)
-    states: PyTree  # x_t
-    log_before: Float[Array, " n"]  # log of the likelihood of y_1..y_(t-1)
-    log_last: Float[Array, " n"]  # and of y_t
+    noise: Array  # (n, steps, k), normal; or the words of a key, (n, steps, 2)
+    states: PyTree
+    log_before: Float[Array, " n"]
+    log_last: Float[Array, " n"]
 
 
-def first_paths(key: Key[Array, ""], model: Any, number: int, length: int) -> Paths:
+def check_start(model: Any, needed_by: str) -> None:
+    """Raise a `ValueError` for a model whose x_0 cannot be moved, or whose inputs are hidden."""
+    has_density = callable(getattr(model, "log_initial", None)) and not is_marginalised(model)
+    if not is_made_of_noise(model, "initial") and not has_density:
+        how = "nor makes x_0 of noise, initial_from_noise"
+        raise ValueError(f"model: {shown(model)} defines no log_initial, {how}; {needed_by}")
+    if takes_inputs(model) and inputs_of(model) is _HIDDEN:
+        raise ValueError(f"model: {shown(model)} has inputs but no field `inputs`; {needed_by}")
+
+
+_HIDDEN = object()
+
+
+def inputs_of(model: Any) -> PyTree:
+    """u_t of a model that has been given them."""
+    while not hasattr(model, "inputs") and hasattr(model, "model"):
+        model = model.model
+    return getattr(model, "inputs", _HIDDEN if takes_inputs(model) else None)
+
+
+def first_paths(key: Key[Array, ""], model: Any, num_particles: int, num_steps: int) -> Paths:
+    """The paths before any observation, and after them those of the pilot."""
     key_places, key_noise = split(key, 2)
+    model, n = without_gradient(model), num_particles + max(2, round(PILOT * num_particles))
     if is_made_of_noise(model, "initial"):
-        places = normal(key_places, (number, model.initial_noise_dimension), default_float())
+        places = normal(key_places, (n, model.initial_noise_dimension), default_float())
     else:
-        places = model.sample_initial(key_places, number)
-    states, zeros = states_of(model, places), jnp.zeros(number, default_float())
-    k = noise_size(model, states)
-    noise = anew(model, states, jax.random.bits(key_noise, (length * k, number), jnp.uint32))
-    return Paths(places, noise.reshape(number, length, k), states, zeros, zeros)
+        places = model.sample_initial(key_places, n)
+    states, zeros = _initial(model, places), jnp.zeros(n, default_float())
+    k = _noise_size(model, states)
+    noise = _noise_of(model, states, bits(key_noise, (num_steps * k, n)))
+    return Paths(places, noise.reshape(n, num_steps, k), states, zeros, zeros)
 
 
-def states_of(model: Any, places: PyTree) -> PyTree:
+def observe(
+    key: Key[Array, ""], model: Any, window: Window, paths: Paths, t: Int[Array, ""], n: int
+) -> tuple[Paths, Float[Array, ""]]:
+    """The paths given y_t too, t from 1 on, and log p(y_t | y_1..y_{t-1}), of the first n."""
+    model, window, paths = without_gradient((model, window, paths))
+    paths, number = _advanced(model, window, paths, t - 1), paths.noise.shape[0]
+    is_pilot = jnp.arange(number) >= n
+    targets = jnp.array([n, number - n], jnp.int32)
+    num_moves = jnp.array(MOVES)[jnp.minimum(t, len(MOVES)) - 1]
+    num_words = 5 + 2 * flatten_states(paths.places).shape[1] + _noise_size(model, paths.states)
+    d = flatten_states(paths.places).shape[1]
+
+    def resampled(key: Key[Array, ""], paths: Paths, log_weights: Float[Array, " n"]) -> Paths:
+        most = jnp.where(is_pilot, jnp.max(log_weights[n:]), jnp.max(log_weights[:n]))
+        # Without any mass they stay as they are.
+        log_weights = jnp.where(most > -jnp.inf, log_weights, 0.0)
+        mixture = single_component(paths.places, 2).replace(
+            log_weights=log_weights, component_indicators=is_pilot.astype(jnp.int32)
+        )
+        line = in_line(mixture, sort_by=HILBERT if 1 <= d <= MOST_DIMENSIONS else None)
+        parents = draw_ancestors(key, line, targets, "systematic", num_slots=number).particles
+        return jax.tree.map(lambda leaf: take(leaf, parents), paths)
+
+    def stage(carry: tuple) -> tuple:
+        key, paths, power, log_mean, count = carry
+        key, key_drawn, key_moves = split(key, 3)
+        growth = _growth(paths.log_last[n:], 1 - power)
+        after = jnp.where((count == MOST_POWERS) | (power + growth > 1 - 1e-6), 1.0, power + growth)
+        log_weights = (after - power) * paths.log_last
+        log_mean += log_sum_exp(log_weights[:n]) - np.log(n)
+        paths = resampled(key_drawn, paths, log_weights)
+        pilot = flatten_states(paths.places)[n:]
+
+        def move(i: Int[Array, ""], paths: Paths) -> Paths:
+            words = bits(jax.random.fold_in(key_moves, i), (num_words, number))
+            s = (words[0, 0] % t.astype(jnp.uint32)).astype(jnp.int32)
+            places, noise = _proposed(words[1:], model, paths, s, pilot)
+            new = _followed(model, window, places, noise, t)
+            log_ratio = _log_target(model, new, after) - _log_target(model, paths, after)
+            chance = uniform_of(words[1], log_ratio.dtype)
+            return select_rows(jnp.log(chance) < log_ratio, new, paths)
+
+        # Where y_t is no surprise at all, the draws are as good as new ones.
+        is_one_power = (power == 0) & (after == 1)
+        paths = jax.lax.fori_loop(0, jnp.where(is_one_power, 0, num_moves), move, paths)
+        return key, paths, after, log_mean, count + 1
+
+    zero = jnp.zeros((), default_float())
+    first = key, paths, zero, zero, jnp.ones((), jnp.int32)
+    _, paths, _, log_mean, _ = jax.lax.while_loop(lambda carry: carry[2] < 1, stage, first)
+    return paths, log_mean
+
+
+def window_start(
+    key: Key[Array, ""], model: Any, window: Window, num_particles: int
+) -> tuple[Paths, Float[Array, " steps"]]:
+    """N paths that represent p(x_0..x_L | y_1..y_L), and log p(y_t | y_1..y_{t-1}) of each step.
+
+    `paths.states` are x_L, equally weighted; Ẑ is unbiased. The model has `log_initial`, or x_0 is
+    made of noise. Use it where the prior is wide beside few observations together.
+    """
+    num_steps = window.present.shape[0]
+    key_first, key_steps = split(key, 2)
+
+    def advance(paths: Paths, step: tuple) -> tuple[Paths, Float[Array, ""]]:
+        return observe(step[0], model, window, paths, step[1], num_particles)
+
+    paths = first_paths(key_first, model, num_particles, num_steps)
+    steps = jax.random.split(key_steps, num_steps), jnp.arange(1, num_steps + 1)
+    paths, log_means = jax.lax.scan(advance, paths, steps)
+    return jax.tree.map(lambda leaf: leaf[:num_particles], paths), log_means
+
+
+def with_derivatives(
+    model: Any, window: Window, paths: Paths, t: Int[Array, ""]
+) -> tuple[PyTree, Float[Array, " n"]]:
+    """x_t of each path with its derivatives, and log p(x_0, y_1..y_t | noise), for them alone.
+
+    By Fisher's identity the mean of the derivatives of the second is the score of y_1..y_t.
+    """
+
+    def advance(now: Paths, s: Int[Array, ""]) -> tuple[Paths, None]:
+        new = _advanced(model, window, now, s)
+        return jax.tree.map(lambda new, old: jnp.where(s < t, new, old), new, now), None
+
+    zeros = jnp.zeros_like(paths.log_last)
+    first = Paths(paths.places, paths.noise, _initial(model, paths.places), zeros, zeros)
+    last, _ = jax.lax.scan(advance, first, jnp.arange(window.present.shape[0]))
+
+    def tied(value: Array, source: Array) -> Array:
+        return add_gradient(value, source) if jnp.issubdtype(value.dtype, jnp.inexact) else value
+
+    return jax.tree.map(tied, paths.states, last.states), _log_target(model, last, 1.0)
+
+
+def _log_target(model: Any, paths: Paths, power: Any) -> Float[Array, " n"]:
+    if is_made_of_noise(model, "initial"):
+        log_prior = -0.5 * jnp.sum(paths.places**2, axis=1)
+    else:
+        log_prior = model.log_initial(paths.places)
+    return log_prior + paths.log_before + power * paths.log_last
+
+
+def _initial(model: Any, places: PyTree) -> PyTree:
     of_noise = is_made_of_noise(model, "initial")
     return with_moments(model, model.initial_from_noise(places) if of_noise else places)
 
 
-def log_prior(model: Any, places: PyTree) -> Float[Array, " n"]:
-    if is_made_of_noise(model, "initial"):
-        return -0.5 * jnp.sum(places**2, axis=1)
-    return model.log_initial(places)
-
-
-def has_noise(model: Any) -> bool:
+def _is_of_noise(model: Any) -> bool:
     return is_made_of_noise(model) or is_mixed(model)
 
 
-def noise_size(model: Any, states: PyTree) -> int:
-    return noise_dimension(model, states) if has_noise(model) else 2
+def _noise_size(model: Any, states: PyTree) -> int:
+    return noise_dimension(model, states) if _is_of_noise(model) else 2
 
 
-def anew(model: Any, states: PyTree, words: UInt32[Array, "k n"]) -> Array:
+def _noise_of(model: Any, states: PyTree, words: UInt32[Array, "k n"]) -> Array:
     """Noise of these random bits: normal, or the words of keys."""
-    return (normal_of(words, noise_dtype(states)) if has_noise(model) else words).T
+    return (normal_of(words, noise_dtype(states)) if _is_of_noise(model) else words).T
 
 
-def turned(noise: Array, anew: Array) -> Array:
-    return TURN * noise + (1 - TURN**2) ** 0.5 * anew if anew.dtype != jnp.uint32 else anew
-
-
-def advanced(model, window, noise, s, states):
-    at = lambda leaf: jax.lax.dynamic_index_in_dim(leaf, s, keepdims=False)  # noqa: E731
-    model = with_inputs(model, jax.tree.map(at, window.inputs))
-    now = jax.lax.dynamic_index_in_dim(noise, s, 1, keepdims=False)
-    if has_noise(model):
-        draws = made_of(model, now, states)
+def _advanced(model: Any, window: Window, paths: Paths, s: Int[Array, ""]) -> Paths:
+    """The paths one step further, to that of index s."""
+    now, noise = window.at(s), jax.lax.dynamic_index_in_dim(paths.noise, s, 1, False)
+    model = with_inputs(model, now.inputs)
+    if _is_of_noise(model):
+        draws = made_of(model, noise, paths.states)
     else:
-        alone = lambda tree: jax.tree.map(lambda leaf: leaf[None], tree)  # noqa: E731
 
-        def draw(words, state):
-            one = drawn(jax.random.wrap_key_data(words), model, alone(state))
-            return jax.tree.map(lambda leaf: leaf[0], one)
+        def draw(words: UInt32[Array, "2"], state: PyTree) -> PyTree:
+            alone = jax.tree.map(lambda leaf: leaf[None], state)
+            moved = drawn(jax.random.wrap_key_data(words), model, alone)
+            return jax.tree.map(lambda leaf: leaf[0], moved)
 
-        draws = jax.vmap(draw)(now, states)
-    moved, logs = seen(model, jax.tree.map(at, window.observations), completed(model, draws, states))
-    return moved, jnp.where(window.present[s], sum(logs), 0.0)
+        draws = jax.vmap(draw)(noise, paths.states)
+    states, logs = seen(model, now.observations, completed(model, draws, paths.states))
+    log_last = jnp.where(now.present, sum(logs), 0.0).astype(paths.log_last.dtype)
+    log_before = paths.log_before + paths.log_last
+    return paths._replace(states=states, log_before=log_before, log_last=log_last)
 
 
-def followed(model, window, places, noise, t) -> Paths:
-    def advance(s, path):
-        states, log_last = advanced(model, window, noise, s, path.states)
-        return path._replace(
-            states=states, log_before=path.log_before + path.log_last, log_last=log_last
-        )
-
+def _followed(
+    model: Any, window: Window, places: PyTree, noise: Array, t: Int[Array, ""]
+) -> Paths:
+    """The paths from these x_0 and of this noise, to step t."""
     zeros = jnp.zeros(noise.shape[0], default_float())
-    start = Paths(places, noise, states_of(model, places), zeros, zeros)
-    return jax.lax.fori_loop(0, t, advance, start)
+    first = Paths(places, noise, _initial(model, places), zeros, zeros)
+    return jax.lax.fori_loop(0, t, lambda s, now: _advanced(model, window, now, s), first)
 
 
-def growth(log_last: Float[Array, " p"], power) -> Float[Array, ""]:
-    """By how much the power may grow, so that enough of the pilot stays effective."""
+def _growth(log_last: Float[Array, " p"], rest: Float[Array, ""]) -> Float[Array, ""]:
+    """The growth of the power, up to the `rest`, that leaves enough of the pilot effective.
+
+    Those without any likelihood are lost with the smallest power, and do not count.
+    """
     below = log_last - finite_max(log_last)
-    alive = jnp.sum(log_last > -jnp.inf)
+    number = jnp.sum((log_last > -jnp.inf).astype(log_last.dtype))
 
-    def halve(_, bounds):
+    def halve(_: Any, bounds: tuple) -> tuple:
         low, high = bounds
         middle = (low + high) / 2
         weights = exp(middle * below)
-        enough = jnp.sum(weights) ** 2 >= LEAST_PART * alive * jnp.sum(weights**2)
-        return jnp.where(enough, middle, low), jnp.where(enough, high, middle)
+        is_enough = jnp.sum(weights) ** 2 >= LEAST_PART * number * jnp.sum(weights**2)
+        return jnp.where(is_enough, middle, low), jnp.where(is_enough, high, middle)
 
-    rest = 1 - power
-    low, high = jax.lax.fori_loop(0, 24, halve, (0.0 * rest, 2 * rest))
-    return jnp.minimum(low, rest)
+    return jnp.minimum(jax.lax.fori_loop(0, 24, halve, (0 * rest, 2 * rest))[0], rest)
 
 
-def proposed(words, model, paths, s, pilot):
-    """The paths from other x_0, or with other noise of step s."""
-    p, d = pilot.shape
-    flat, dtype = flatten_states(paths.places), pilot.dtype
+def _proposed(
+    words: UInt32[Array, "w n"], model: Any, paths: Paths, s: Int[Array, ""], pilot: Array
+) -> tuple[PyTree, Array]:
+    """Other x_0 with the same noise, or the same with other noise of step s.
+
+    Steps of x_0 are walks of many sizes, in each coordinate another, and differences of two of the
+    pilot, which are in order along a curve, any distance apart: those of neighbours fit a mode, and
+    others lead from mode to mode.
+    """
+    (p, d), flat = pilot.shape, flatten_states(paths.places)
     to_places = jax.vmap(ravel_pytree(jax.tree.map(lambda leaf: leaf[0], paths.places))[1])
-    choice, first, second, size = uniform_of(words[:4], dtype)
-    sizes, directions = uniform_of(words[4 : 4 + d], dtype).T, normal_of(words[4 + d : 4 + 2 * d], dtype).T
-    is_near = choice < NEIGHBOURS
-    a = (first * p).astype(jnp.int32)
-    b = jnp.where(is_near, a + 1 + (8 * second).astype(jnp.int32), (second * p).astype(jnp.int32)) % p
-    factor = jnp.where(is_near, jnp.where(size < .5, 1., -1.) * .2 * (1.5/.2) ** (2 * size % 1), 1.0)
-    apart = factor[:, None] * (take(pilot, a) - take(pilot, b))
-    walk = jnp.std(pilot, axis=0, keepdims=True) * LEAST_SIZE ** sizes * directions
-    step = jnp.where((choice < WALK)[:, None], walk, apart)
-    of_noise = (choice < NOISE)[:, None]
-    places = to_places(flat + jnp.where(of_noise, 0.0, step))
-    now = jax.lax.dynamic_index_in_dim(paths.noise, s, 1, keepdims=False)
-    now = jnp.where(of_noise, turned(now, anew(model, paths.states, words[4 + 2 * d :])), now)
-    noise = jax.lax.dynamic_update_index_in_dim(paths.noise, now, s, 1)
-    # The turn leaves the law of the noise as it is.
-    return places, noise
-
-
-def observe(key, model, window, paths, t, n):
-    """y_t, t from 1 on."""
-    states, log_last = advanced(model, window, paths.noise, t - 1, paths.states)
-    paths = paths._replace(
-        states=states, log_before=paths.log_before + paths.log_last, log_last=log_last
-    )
-    number = paths.noise.shape[0]
-    labels = (jnp.arange(number) >= n).astype(jnp.int32)
-    targets = jnp.array([n, number - n], jnp.int32)
-    d = flatten_states(paths.places).shape[1]
-    num_words = 5 + 2 * d + noise_size(model, paths.states)
-    moves = take(jnp.array(MOVES), jnp.minimum(t, len(MOVES)) - 1)
-
-    def stage(carry):
-        key, paths, power, log_z, count, cost = carry
-        key, key_drawn, key_moves = split(key, 3)
-        grown = growth(paths.log_last[n:], power)
-        after = jnp.where((count >= MOST_POWERS) | (grown + power > 1 - 1e-6), 1.0, power + grown)
-        log_weights = jnp.where(power < after, (after - power) * paths.log_last, 0.0)
-        log_z += log_sum_exp(log_weights[:n]) - jnp.log(n)
-        dead = jnp.array([jnp.max(log_weights[:n]), jnp.max(log_weights[n:])]) == -jnp.inf
-        mixture = single_component(paths.places, 2).replace(
-            log_weights=jnp.where(dead[labels], 0.0, log_weights), component_indicators=labels
-        )
-        line = in_line(mixture, sort_by=HILBERT)
-        parents = draw_ancestors(
-            key_drawn, line, targets, "systematic", num_slots=number
-        ).particles
-        paths = jax.tree.map(lambda leaf: take(leaf, parents), paths)
-        pilot = flatten_states(paths.places)[n:]
-
-        def move(i, paths):
-            words = jax.random.bits(jax.random.fold_in(key_moves, i), (num_words, number), jnp.uint32)
-            s = (words[0, 0] % t.astype(jnp.uint32)).astype(jnp.int32)
-            new = followed(model, window, *proposed(words[1:], model, paths, s, pilot), t)
-            log = lambda paths: (  # noqa: E731
-                log_prior(model, paths.places) + paths.log_before + after * paths.log_last
-            )
-            taken = jnp.log(uniform_of(words[0], default_float())) < log(new) - log(paths)
-            pick = lambda new, old: jnp.where(taken.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
-            return jax.tree.map(pick, new, paths)
-
-        at_once = (power == 0) & (after == 1)
-        m = jnp.where(at_once, 0, moves)
-        paths = jax.lax.fori_loop(0, m, move, paths)
-        return key, paths, after, log_z, count + 1, cost + m * t
-
-    zero = jnp.zeros((), default_float())
-    start = key, paths, zero, zero, jnp.zeros((), jnp.int32), jnp.ones((), jnp.int32)
-    _, paths, _, log_z, count, cost = jax.lax.while_loop(lambda carry: carry[2] < 1, stage, start)
-    return paths, log_z, (count, cost)
-
-
-def window_start(key, model, window, num_particles, pilot=None):
-    length = window.present.shape[0]
-    number = num_particles + (pilot or max(num_particles // 5, 2))
-    key_first, key_steps = split(key, 2)
-    paths = first_paths(key_first, model, number, length)
-
-    def advance(paths, step):
-        key, t = step
-        paths, *found = observe(key, model, window, paths, t, num_particles)
-        return paths, found
-
-    steps = jax.random.split(key_steps, length), jnp.arange(1, length + 1)
-    paths, (log_z, costs) = jax.lax.scan(advance, paths, steps)
-    return jax.tree.map(lambda leaf: leaf[:num_particles], paths), log_z, costs
+    kind, first, apart = uniform_of(words[1:4], pilot.dtype)
+    sizes, directions = words[4 : 4 + d], words[4 + d : 4 + 2 * d]
+    deviations = jnp.std(pilot, axis=0, keepdims=True)
+    walk = deviations * LEAST_SIZE ** uniform_of(sizes, pilot.dtype).T
+    walk *= normal_of(directions, pilot.dtype).T
+    one = (first * p).astype(jnp.int32)
+    distance = jnp.exp(jnp.log(p / 2) * apart).astype(jnp.int32)
+    other = (one + jnp.where(words[3] % 2 == 0, distance, p - distance)) % p
+    step = select_rows(kind < OF_NOISE + OF_WALKS, walk, take(pilot, one) - take(pilot, other))
+    moves_noise = kind < OF_NOISE
+    places = to_places(flat + select_rows(moves_noise, jnp.zeros_like(step), step))
+    now = jax.lax.dynamic_index_in_dim(paths.noise, s, 1, False)
+    anew = _noise_of(model, paths.states, words[4 + 2 * d :])
+    if _is_of_noise(model):
+        anew = KEPT_NOISE * now + np.sqrt(1 - KEPT_NOISE**2) * anew
+    now = select_rows(moves_noise, anew, now)
+    return places, jax.lax.dynamic_update_index_in_dim(paths.noise, now, s, 1)

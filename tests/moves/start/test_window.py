@@ -1,0 +1,156 @@
+"""A start by the first observations: unbiased, also with hard edges, and every mode has its mass."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.exact import kalman_filter
+from mpfjax.moves.start.window import Window, check_start, window_start
+from tests.unbiased import assert_unbiased
+
+KEY = jax.random.key(0)
+
+
+def window_of(observations, present=None):
+    observations = jnp.asarray(observations, jnp.float32)
+    present = np.ones(len(observations), bool) if present is None else present
+    return Window(observations, None, jnp.asarray(present))
+
+
+def starts(model, window, num_particles, num_runs, key=KEY):
+    """x_L of each run, and its log Ẑ."""
+
+    @jax.jit
+    def start(key):
+        paths, log_means = window_start(key, model, window, num_particles)
+        return paths.states, jnp.sum(log_means)
+
+    return jax.tree.map(np.asarray, jax.lax.map(start, jax.random.split(key, num_runs)))
+
+
+# A place in the plane, anywhere, that is observed with a small error. x_0 and x_t are made of noise.
+PLANE = mpfjax.LinearGaussianModel(
+    np.eye(2), 0.01 * np.eye(2), np.eye(2), 0.09 * np.eye(2), np.zeros(2), 400 * np.eye(2)
+)
+PLACES = np.array([[3.0, 1.0], [3.3, 1.2], [0.0, 0.0], [3.1, 1.4]], np.float32)
+PRESENT = np.array([True, True, False, True])
+SEEN = mpfjax.Series.skipping(np.where(PRESENT[:, None], PLACES, np.nan))
+
+
+class WithKeys(mpfjax.AbstractStateSpaceModel):
+    """The same, with a density of x_0, and nothing of what the noise is."""
+
+    def sample_initial(self, key, num_particles):
+        return 20 * jax.random.normal(key, (num_particles, 2))
+
+    def log_initial(self, states):
+        return jnp.sum(jax.scipy.stats.norm.logpdf(states, 0.0, 20.0), axis=1)
+
+    def sample_transition(self, key, states):
+        return states + 0.1 * jax.random.normal(key, states.shape)
+
+    def log_likelihood(self, observation, states):
+        return jnp.sum(jax.scipy.stats.norm.logpdf(observation[None], states, 0.3), axis=1)
+
+
+@pytest.mark.parametrize("model", [PLANE, WithKeys()], ids=["noise", "keys"])
+def test_evidence_and_moments_are_unbiased(model):
+    """The third observation is missing."""
+    states, log_z = starts(model, window_of(PLACES, PRESENT), 100, 300)
+    exact = kalman_filter(PLANE, SEEN)
+    ratios = np.exp(log_z - float(exact.log_marginal_likelihood))
+    assert_unbiased(ratios, loosest=0.06, errors=3.0)
+    means = ratios[:, None] * states.mean(axis=1)
+    assert_unbiased(means, np.asarray(exact.means[-1]), errors=3.5)
+
+
+class Edged(WithKeys):
+    """A number anywhere from -20 to 20, of which it is known at each step where it is within .5."""
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.uniform(key, (num_particles,), minval=-20.0, maxval=20.0)
+
+    def log_initial(self, states):
+        return jnp.where(jnp.abs(states) < 20, 0.0, -jnp.inf)
+
+    def log_likelihood(self, observation, states):
+        return jnp.where(jnp.abs(states - observation) < 0.5, 0.0, -jnp.inf)
+
+
+def test_hard_edges_leave_the_evidence_unbiased():
+    """Beside sums over a grid; 60 draws and a pilot of 12 meet y_1 by one or two."""
+    places = np.array([12.0, 12.3, 11.8, 11.7], np.float32)
+    _, log_z = starts(Edged(), window_of(places), 60, 1500)
+    grid = np.linspace(-21, 21, 8401)
+    law = (np.abs(grid) < 20) / 40 * 0.005
+    steps = np.exp(-0.5 * (np.arange(-100, 101) * 0.05) ** 2)
+    for place in places:
+        law = np.convolve(law, steps / steps.sum(), mode="same") * (np.abs(grid - place) < 0.5)
+    assert_unbiased(np.exp(log_z) / law.sum(), loosest=0.04, errors=3.0)
+
+
+def test_a_start_without_any_likelihood_says_so():
+    _, log_z = starts(Edged(), window_of([30.0, 30.0]), 40, 2)
+    assert (log_z == -np.inf).all()
+
+
+class Rooms(WithKeys):
+    """Nine rooms of one by one; where in its room the state is, is observed to a hundredth."""
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.uniform(key, (num_particles, 2), maxval=3.0)
+
+    def log_initial(self, states):
+        return jnp.where(jnp.all((states > 0) & (states < 3), axis=1), 0.0, -jnp.inf)
+
+    def sample_transition(self, key, states):
+        return states + 0.003 * jax.random.normal(key, states.shape)
+
+    def log_likelihood(self, observation, states):
+        gaps = states % 1.0 - observation[None]
+        return -0.5 * jnp.sum((gaps / 0.01) ** 2, axis=1)
+
+
+def test_equal_modes_have_equal_masses():
+    """A mode is 6e-4 of the prior, so that 60 of the paths and none of the pilot hits it at first."""
+    places = np.array([[0.3, 0.6]] * 4) + np.array([[0.01, -0.01], [0, 0], [0.005, 0], [0, -0.01]])
+    states, _ = starts(Rooms(), window_of(places), 500, 8)
+    rooms = np.floor(states).astype(int) @ [1, 3]
+    masses = np.mean(rooms[:, :, None] == np.arange(9), axis=1)
+    assert np.sqrt(np.mean((masses - 1 / 9) ** 2)) < 0.05
+    assert masses.min() > 0.01
+
+
+def test_a_model_whose_x_0_cannot_be_moved_is_refused():
+    class OnlyDraws(Rooms):
+        log_initial = None
+
+    with pytest.raises(ValueError, match="OnlyDraws.* defines no log_initial"):
+        check_start(OnlyDraws(), "a start needs it")
+
+
+@pytest.mark.exactness
+def test_the_paths_have_the_score_of_what_was_observed():
+    """Fisher's identity, beside the derivative of the Kalman filter's log-likelihood."""
+    from mpfjax.moves.start.window import with_derivatives
+
+    window = window_of(PLACES, PRESENT)
+
+    def log_z(scale):
+        model = eqx.tree_at(lambda m: m.P0, PLANE, scale * PLANE.P0)
+        return kalman_filter(model, SEEN).log_marginal_likelihood
+
+    @jax.jit
+    def score(key):
+        def log_target(scale):
+            model = eqx.tree_at(lambda m: m.P0, PLANE, scale * PLANE.P0)
+            paths, _ = window_start(key, model, window, 200)
+            return jnp.mean(with_derivatives(model, window, paths, jnp.int32(4))[1])
+
+        return jax.grad(log_target)(1.0)
+
+    scores = jax.lax.map(score, jax.random.split(KEY, 40))
+    assert_unbiased(scores, float(jax.grad(log_z)(1.0)), slack=0.05)
