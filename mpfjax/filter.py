@@ -18,6 +18,7 @@ from mpfjax.moves.base import (
     AbstractMove,
     AbstractPropagation,
     AbstractPropagationOfEach,
+    AbstractRegrouping,
     Moves,
     Step,
     all_of,
@@ -103,10 +104,7 @@ class Filter(eqx.Module):
     @property
     def propagation(self) -> AbstractPropagationOfEach | None:
         """The move by which x_t of one particle is drawn and weighed without a look at others."""
-        for move in self.moves:
-            if isinstance(move, AbstractPropagationOfEach):
-                return move
-        return None
+        return propagation_of(self.moves)
 
     @property
     def weighs_initially(self) -> bool:
@@ -197,7 +195,8 @@ class Filter(eqx.Module):
         mixture = mixture.replace(memory=memory_of(self.moves, self.model, self.num_components))
         now = self._now(observation, is_initial=True)
         for move_key, move in zip(keys, self.initial_moves, strict=True):
-            mixture = move(move_key, mixture, now)
+            # Those that regroup x_0 need no observation.
+            mixture = move(move_key, mixture, None if isinstance(move, AbstractRegrouping) else now)
         if self.weighs_initially:
             mixture, log_mass = mixture.normalised(mixture)
             mixture = mixture.replace(log_scale=log_mass, waits=log_mass != 0)
@@ -249,6 +248,17 @@ class Filter(eqx.Module):
 
 _one_step = jit_with_floats_traced(Filter._step_and_faults)
 _start = jit_with_floats_traced(Filter._start_and_faults)
+
+
+def propagation_of(moves: Moves) -> AbstractPropagationOfEach | None:
+    """The first move that propagates particles each on its own, also within a wrapper."""
+    for move in moves:
+        if isinstance(move, AbstractPropagationOfEach):
+            return move
+        held = None if isinstance(move, AbstractPropagation) else propagation_of(move.inner)
+        if held is not None:
+            return held
+    return None
 
 
 def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: str) -> None:

@@ -33,7 +33,6 @@ from mpfjax.transforms import (
     with_lookahead,
     with_point_sets,
     with_score_gradient,
-    with_selected_start,
 )
 
 Importance = Literal["propagated", "predictive_gaussian"]
@@ -134,8 +133,6 @@ def mixture_particle_filter(
     )
     seen = _seen(model, features, scale)
     filter = _mixture(plain, max_components, seen, _WARM_ITERATIONS, regroup, regroup_every)
-    if max_components > 1:
-        filter = with_selected_start(filter)
     if noise == "rqmc" and proposal is None and not is_marginalised(model):
         filter = with_lookahead(filter)
     return _with(noise, gradient, filter)

@@ -14,13 +14,15 @@ from mpfjax.moves.base import (
     AbstractRegrouping,
     all_of,
 )
-from mpfjax.moves.initial import SelectInitial, require_propagation
+from mpfjax.moves.every import Every
+from mpfjax.moves.initial import require_propagation
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
+from mpfjax.moves.start.start import Begin, Start
 from mpfjax.moves.restarts import RegroupOthers, Restart, WatchStart
 
 
@@ -142,19 +144,32 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
 
 
 @checked
-def with_selected_start(filter: Filter, num_draws: Count | None = None) -> Filter:
-    """The filter whose x_0 is chosen by y_1 among K N draws: a `SelectInitial` moves it first.
+def with_selected_start(filter: Filter, *, num_observations: Count = 8) -> Filter:
+    """The filter that begins with a tempered sampler of x_0 on the first observations: `Start`.
 
-    `num_draws` is K; with one, x_0 is a plain draw again. None, as in mixtures, takes four draws a
-    particle, and more where a pilot shows that the prior is wide. The look at y_1 is that of the
-    filter's own propagation. Raises `ValueError` for K < 1, and for a filter without a `Propagate`
-    or `PropagateNested`. Use it where the prior is wide beside the likelihood.
+    In its first L steps it costs as much as 300 others where the prior is wide, and next to nothing
+    where it is not; Ẑ is unbiased. Give y_1 to `filter.init` as well as to the first step. Raises
+    `ValueError` for a model without `log_initial` whose x_0 is not made of noise. Use it where the
+    prior is wide, as of a pose in a building: few draws of x_0 fit what is observed, and the masses
+    of modes are those of chance. `num_observations` is L: as many as tell the modes.
     """
-    others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
-    if num_draws == 1:
-        return filter.replace(initial_moves=others)
-    select = SelectInitial(num_draws, filter.initial_noise)
-    return filter.replace(initial_moves=[select, *others])
+    if _has(filter, Start):
+        raise ValueError("filter: it begins by the first observations already")
+    does_more = [t for t, move in enumerate(filter.moves) if not _regroups(move)]
+    last = 1 + max(does_more, default=-1)
+    grouping = filter.initial_moves
+    if not all(map(_regroups, grouping)):
+        raise ValueError("filter: its initial moves do more than regroup, which a start replaces")
+    start = Start(filter.moves[:last], grouping, num_observations)
+    return filter.replace(
+        moves=[start, *filter.moves[last:]], initial_moves=[*grouping, Begin(num_observations)]
+    )
+
+
+def _regroups(move: AbstractMove) -> bool:
+    """Whether it regroups alone, at every step or not."""
+    is_of_these = bool(move.inner) and all(map(_regroups, move.inner))
+    return isinstance(move, AbstractRegrouping) or (isinstance(move, Every) and is_of_these)
 
 
 @checked

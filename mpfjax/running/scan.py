@@ -95,11 +95,12 @@ def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> P
     On islands it has the share of one of them in the mass of all.
     """
     log_islands = math.log(num_islands())
-    if not filter.weighs_initially:
-        mixture = filter._init(key)
-        return mixture.replace(log_weights=mixture.log_weights - log_islands)
     first = jax.tree.map(lambda leaf: leaf[0], series)
     given = filter.with_inputs(first.inputs)
+    if not filter.weighs_initially:
+        # Where it is missing, it tells the form of those that follow.
+        mixture = given._init(key, first.observations)
+        return mixture.replace(log_weights=mixture.log_weights - log_islands)
     if first.present is None:
         mixture = given._init(key, first.observations)
     else:

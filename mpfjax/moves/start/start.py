@@ -158,7 +158,7 @@ class Start(AbstractWrapper):
 def in_turn(
     key: Key[Array, ""], moves: Moves, mixture: ParticleMixture, now: PyTree
 ) -> ParticleMixture:
-    """The mixture after the moves, one after the other; without the normalising between."""
+    """The mixture after the moves, one after the other."""
     for move_key, move in zip(split(key, len(moves)), moves, strict=True) if moves else ():
         mixture = move(move_key, mixture, now)
-    return mixture
+    return mixture.replace(in_order=False)
