@@ -1,7 +1,7 @@
 """Filters made from filters, by changing their moves. They compose, also on chains of your own."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from mpfjax.checks import Count, InnerShare, checked
@@ -22,8 +22,9 @@ from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
+from mpfjax.moves.restarts import WatchStart
+from mpfjax.moves.start.restarts import BeginRecent, Restart
 from mpfjax.moves.start.start import Begin, Start
-from mpfjax.moves.restarts import RegroupOthers, Restart, WatchStart
 
 
 @checked
@@ -155,67 +156,68 @@ def with_selected_start(filter: Filter, *, num_observations: Count = 8) -> Filte
     """
     if _has(filter, Start):
         raise ValueError("filter: it begins by the first observations already")
-    does_more = [t for t, move in enumerate(filter.moves) if not _regroups(move)]
-    last = 1 + max(does_more, default=-1)
-    grouping = filter.initial_moves
-    if not all(map(_regroups, grouping)):
+    last, initial = _last(filter), filter.initial_moves
+    grouping = tuple(m for m in initial if not isinstance(m, BeginRecent))
+    if not all(map(_regroups, initial)):
         raise ValueError("filter: its initial moves do more than regroup, which a start replaces")
     start = Start(filter.moves[:last], grouping, num_observations)
     return filter.replace(
-        moves=[start, *filter.moves[last:]], initial_moves=[*grouping, Begin(num_observations)]
+        moves=[start, *filter.moves[last:]], initial_moves=[*initial, Begin(num_observations)]
     )
 
 
 def _regroups(move: AbstractMove) -> bool:
-    """Whether it regroups alone, at every step or not."""
-    is_of_these = bool(move.inner) and all(map(_regroups, move.inner))
-    return isinstance(move, AbstractRegrouping) or (isinstance(move, Every) and is_of_these)
+    """Whether it moves no particles, and at most regroups them."""
+    if isinstance(move, Every):
+        return all(map(_regroups, move.moves))
+    return isinstance(move, AbstractRegrouping | WatchStart | Begin | BeginRecent)
 
 
 @checked
 def with_restarts(
     filter: Filter,
     probability: InnerShare = 1e-3,
-    share: InnerShare = 1 / 4,
-    num_draws: Count = 4,
+    *,
+    num_observations: Count = 8,
+    num_draws: Count = 1024,
 ) -> Filter:
     """The filter that finds a state again which begins anew with a small probability: `Restart`.
 
-    At each step x_{t-1} ~ (1 - p) δ + p p_0, and Ẑ is unbiased for this kernel. Draws of x_0 have a
-    component of their own, one more than the filter has, which its regrouping leaves alone. They
-    are an alarm as well, in the place of that of `with_alarm`. Of a filter with restarts it changes
-    the settings. Raises `ValueError` for a filter that does not resample all components at each
-    step by a `Resample`. Use it where a hypothesis may be wrong for good: a robot that is carried
-    away, a lost target.
+    Where the alarm of `with_alarm`, of `num_draws`, rings, a start by the last L observations is
+    joined to the hypotheses there are, by its evidence and p. The step where it rings costs as much
+    as 300 others. Give y_1 to `filter.init`. Of a filter with restarts it changes the settings.
+    Raises `ValueError` for a model without `log_initial` whose x_0 is not made of noise. Use it
+    where a hypothesis may be wrong for good: a robot that is carried away, a lost target.
+    `num_observations` is L.
     """
-    _require_resample(filter, "with which a state begins anew")
-    settings = {"probability": probability, "share": share, "num_draws": num_draws}
-
-    def changed(move: Any) -> Any:
-        return dataclasses.replace(move, **settings) if isinstance(move, Restart) else move
-
-    def restarting(move: Any) -> Any:
-        is_own = isinstance(move, Resample | AuxiliaryResample)
-        return Restart(move, **settings) if is_own else _apart(move)
-
+    if not all(map(_regroups, filter.initial_moves)):
+        raise ValueError("filter: its initial moves do more than regroup, which a restart replaces")
     if _has(filter, Restart):
-        return _map_chain(changed, filter)
-    return filter.replace(
-        moves=[restarting(move) for move in filter.moves if not isinstance(move, WatchStart)],
-        initial_moves=[_apart(move) for move in filter.initial_moves],
-        num_components=filter.num_components + 1,
-    )
+        raise ValueError("filter: it has restarts already")
+    if not _has(filter, WatchStart):
+        filter = with_alarm(filter, num_draws)
+    first, *others = filter.moves
+    grouping = tuple(m for m in filter.initial_moves if not isinstance(m, Begin))
+
+    def restart(moves: Sequence[Any]) -> Restart:
+        return Restart(tuple(moves), grouping, probability, num_observations)
+
+    if isinstance(first, Start):
+        moves = [dataclasses.replace(first, moves=(restart(first.moves),)), *others]
+    else:
+        last = _last(filter)
+        moves = [restart(filter.moves[:last]), *filter.moves[last:]]
+    begin = BeginRecent(num_observations)
+    return filter.replace(moves=moves, initial_moves=[*filter.initial_moves, begin])
 
 
 def _has(filter: Filter, kind: type) -> bool:
-    return any(isinstance(move, kind) for move in filter.moves)
+    return any(isinstance(move, kind) for move in all_of(filter.moves))
 
 
-def _apart(move: Any) -> Any:
-    """The move with its regroupings kept from the component of restarts."""
-    if isinstance(move, AbstractRegrouping):
-        return RegroupOthers(move)
-    return move.map_inner(_apart)
+def _last(filter: Filter) -> int:
+    """How many moves there are up to the last that does more than regroup."""
+    return 1 + max(t for t, move in enumerate(filter.moves) if not _regroups(move))
 
 
 @checked

@@ -19,7 +19,7 @@ from mpfjax.moves.start.window import (
     observe,
     with_derivatives,
 )
-from mpfjax.operations.logarithms import add_gradient, default_float, log_sum_exp, without_gradient
+from mpfjax.operations.logarithms import add_gradient, default_float, log_sum_exp
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import cond_if_any
 

@@ -248,9 +248,7 @@ def _advanced(model: Any, window: Window, paths: Paths, s: Int[Array, ""]) -> Pa
     return paths._replace(states=states, log_before=log_before, log_last=log_last)
 
 
-def _followed(
-    model: Any, window: Window, places: PyTree, noise: Array, t: Int[Array, ""]
-) -> Paths:
+def _followed(model: Any, window: Window, places: PyTree, noise: Array, t: Int[Array, ""]) -> Paths:
     """The paths from these x_0 and of this noise, to step t."""
     zeros = jnp.zeros(noise.shape[0], default_float())
     first = Paths(places, noise, _initial(model, places), zeros, zeros)

@@ -1,0 +1,128 @@
+"""The first steps of a filter by a tempered sampler, and its restarts: exact, one at a time or not."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.exact import kalman_filter
+from tests.moves.start.test_window import PLANE, WithKeys
+from tests.unbiased import assert_unbiased, ratios_to
+from tests.user_models import Batched
+
+KEY = jax.random.key(0)
+STEPS, LENGTH = 9, 3
+
+
+def observations():
+    rng = np.random.default_rng(0)
+    places = np.array([3.0, 1.0]) + np.cumsum(0.1 * rng.normal(size=(STEPS, 2)), axis=0)
+    return (places + 0.3 * rng.normal(size=(STEPS, 2))).astype(np.float32)
+
+
+SEEN = observations()
+GAPS = np.where(np.isin(np.arange(STEPS), [0, 5])[:, None], np.nan, SEEN)
+FILTER = mpfjax.with_selected_start(
+    mpfjax.mixture_particle_filter(WithKeys(), 100, 3), num_observations=LENGTH
+)
+
+
+def mean(mixture):
+    return mixture.mean()
+
+
+def test_evidence_and_moments_are_unbiased_beyond_the_window():
+    """Two observations are missing, the first among them."""
+    series = mpfjax.Series.skipping(GAPS)
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 300), FILTER, series, mean)
+    exact = kalman_filter(PLANE, series)
+    ratios = ratios_to(exact, runs)
+    assert_unbiased(ratios, loosest=0.05)
+    means = ratios[:, None, None] * np.asarray(runs.collected)
+    assert_unbiased(
+        means, np.asarray(exact.means)[-1:], slack=1e9 * (np.arange(STEPS) < 8)[:, None]
+    )
+
+
+def test_one_step_at_a_time_is_a_run():
+    run = mpfjax.run_filter(KEY, FILTER, SEEN, mean)
+    key_start, key_steps = jax.random.split(KEY)
+    mixture = FILTER.init(key_start, SEEN[0])
+    for t, key in enumerate(jax.random.split(key_steps, STEPS)):
+        mixture, info = FILTER.step(key, mixture, SEEN[t])
+        np.testing.assert_allclose(info.log_likelihood_increment, run.log_likelihood_increments[t])
+        np.testing.assert_allclose(mixture.mean(), run.collected[t], rtol=1e-5)
+        assert (np.asarray(mixture.ancestor_indices) == -1).all() == (t < LENGTH)
+
+
+def test_fewer_observations_than_the_window_has():
+    run = mpfjax.run_filter(KEY, FILTER, SEEN, mean)
+    short = mpfjax.run_filter(KEY, FILTER, SEEN[: LENGTH - 1], mean)
+    assert np.isfinite(short.log_marginal_likelihood)
+    assert (
+        abs(short.log_marginal_likelihood - run.log_likelihood_increments[: LENGTH - 1].sum()) < 3
+    )
+
+
+@pytest.mark.exactness
+def test_the_gradient_is_the_score():
+    """Fisher's identity in the window; beyond it gradient "stop"."""
+
+    def log_z(scale):
+        return kalman_filter(at(scale), SEEN).log_marginal_likelihood
+
+    def at(scale):
+        return eqx.tree_at(lambda m: m.P0, PLANE, scale * PLANE.P0)
+
+    @jax.jit
+    @jax.grad
+    def score(scale, key):
+        filter = mpfjax.particle_filter(at(scale), 150, gradient="stop")
+        filter = mpfjax.with_selected_start(filter, num_observations=LENGTH)
+        return mpfjax.run_filter(key, filter, SEEN, mean).log_marginal_likelihood
+
+    scores = [score(1.0, key) for key in jax.random.split(KEY, 30)]
+    assert_unbiased(scores, float(jax.grad(log_z)(1.0)), loosest=0.05, slack=0.05)
+
+
+@pytest.mark.exactness
+def test_islands_have_the_masses_of_their_own_starts():
+    def run(key):
+        return mpfjax.run_islands(key, FILTER.replace(num_particles=50), SEEN, mean, num_islands=2)
+
+    runs = jax.jit(jax.vmap(run))(jax.random.split(KEY, 300))
+    assert_unbiased(ratios_to(kalman_filter(PLANE, SEEN), runs))
+
+
+def test_what_cannot_begin_so_is_refused():
+    with pytest.raises(ValueError, match="needs every slot"):
+        mpfjax.monte_carlo(jax.random.split(KEY, 2), FILTER, SEEN, mean, slots=120)
+    with pytest.raises(ValueError, match="defines no log_initial"):
+        mpfjax.with_selected_start(mpfjax.particle_filter(Batched(), 50))
+
+
+# Carried away after six steps; the alarm rings at once, and the start is by the next three.
+CARRIED = np.concatenate([SEEN[:6], SEEN[:6] - 12.0])
+PROBABILITY = 0.01
+
+
+def test_restarts_are_exact_for_a_state_that_began_anew():
+    plain = mpfjax.mixture_particle_filter(WithKeys(), 100, 3)
+    filter = mpfjax.with_restarts(plain, PROBABILITY, num_observations=3, num_draws=200)
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 200), filter, CARRIED, mean)
+    alone, before, after = (
+        float(kalman_filter(PLANE, part).log_marginal_likelihood)
+        for part in (CARRIED, CARRIED[:6], CARRIED[6:])
+    )
+    log_z = np.logaddexp(np.log1p(-PROBABILITY) + alone, np.log(PROBABILITY) + before + after)
+    np.testing.assert_array_equal(np.asarray(runs.surprised)[:, 6:9].all(axis=1), True)
+    assert not np.asarray(runs.surprised)[:, 9:].any()
+    # Before the alarm x_0 are plain draws, of which few are near.
+    tilts = np.asarray(runs.log_likelihood_increments)[:, 6:].sum(axis=1)
+    assert_unbiased(np.exp(tilts - (log_z - before)), loosest=0.05)
+    np.testing.assert_allclose(
+        np.asarray(runs.collected)[:, -1].mean(axis=0),
+        kalman_filter(PLANE, CARRIED[6:]).means[-1],
+        atol=0.1,
+    )
