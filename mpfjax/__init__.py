@@ -86,6 +86,7 @@ from mpfjax.transforms import with_resampling as with_resampling
 from mpfjax.transforms import with_restarts as with_restarts
 from mpfjax.transforms import with_score_gradient as with_score_gradient
 from mpfjax.transforms import with_selected_start as with_selected_start
+from mpfjax.transforms import with_start as with_start
 
 # The one place that says it: pyproject.toml reads it from here.
 __version__ = "0.1.0"

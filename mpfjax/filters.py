@@ -33,6 +33,7 @@ from mpfjax.transforms import (
     with_lookahead,
     with_point_sets,
     with_score_gradient,
+    with_selected_start,
 )
 
 Importance = Literal["propagated", "predictive_gaussian"]
@@ -111,8 +112,8 @@ def mixture_particle_filter(
     with the others only through its mixture weight, so that no component takes particles from
     another. At every third step components that overlap merge, diffuse components split, and two
     iterations of K-means refine the grouping. All of it is exact. If M is more than one, x_0 is
-    chosen by y_1 among four draws a particle, and among many where the prior is very wide beside
-    the likelihood (`SelectInitial`); `with_selected_start(filter, 4)` keeps it at four.
+    chosen by y_1 among four draws a particle (`SelectInitial`). Where the prior is very wide beside
+    the likelihood, take `with_start`.
 
     - `features`, `scale`: the coordinates and units in which the grouping moves see the particles,
       those of x_0 too (see `KMeans`; features of one particle, if the model is wrapped by
@@ -133,6 +134,8 @@ def mixture_particle_filter(
     )
     seen = _seen(model, features, scale)
     filter = _mixture(plain, max_components, seen, _WARM_ITERATIONS, regroup, regroup_every)
+    if max_components > 1:
+        filter = with_selected_start(filter)
     if noise == "rqmc" and proposal is None and not is_marginalised(model):
         filter = with_lookahead(filter)
     return _with(noise, gradient, filter)

@@ -1,7 +1,7 @@
 """Filters made from filters, by changing their moves. They compose, also on chains of your own."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from mpfjax.checks import Count, InnerShare, checked
@@ -15,15 +15,14 @@ from mpfjax.moves.base import (
     all_of,
 )
 from mpfjax.moves.every import Every
-from mpfjax.moves.initial import require_propagation
+from mpfjax.moves.initial import SelectInitial, require_propagation
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.moves.restarts import WatchStart
-from mpfjax.moves.start.restarts import BeginRecent, Restart
+from mpfjax.moves.restarts import RegroupOthers, Restart, WatchStart
 from mpfjax.moves.start.start import Begin, Start
 
 
@@ -145,79 +144,100 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
 
 
 @checked
-def with_selected_start(filter: Filter, *, num_observations: Count = 8) -> Filter:
-    """The filter that begins with a tempered sampler of x_0 on the first observations: `Start`.
+def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
+    """The filter whose x_0 is chosen by y_1 among K N draws: a `SelectInitial` moves it first.
 
-    In its first L steps it costs as much as 300 others where the prior is wide, and next to nothing
-    where it is not; Ẑ is unbiased. Give y_1 to `filter.init` as well as to the first step. Raises
-    `ValueError` for a model without `log_initial` whose x_0 is not made of noise. Use it where the
-    prior is wide, as of a pose in a building: few draws of x_0 fit what is observed, and the masses
-    of modes are those of chance. `num_observations` is L: as many as tell the modes.
+    `num_draws` is K; with one, x_0 is a plain draw again. The look at y_1 is that of the filter's
+    own propagation. Raises `ValueError` for K < 1, and for a filter without a `Propagate` or
+    `PropagateNested`. Use it where the prior is somewhat wide beside the likelihood; where it is
+    very wide, `with_start`.
+    """
+    others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
+    if num_draws > 1 and _has(filter, Start):
+        raise ValueError("filter: its x_0 is chosen by more observations than y_1, by with_start")
+    if num_draws == 1:
+        return filter.replace(initial_moves=others)
+    select = SelectInitial(num_draws, filter.initial_noise)
+    return filter.replace(initial_moves=[select, *others])
+
+
+@checked
+def with_start(filter: Filter, num_observations: Count = 8) -> Filter:
+    """The filter that begins by a tempered sampler on its first L observations: `Start`.
+
+    In these steps it costs as much as 300 others where the prior is wide, and little where it is
+    not; Ẑ stays unbiased, and derivatives in these steps are the score. It takes the place of a
+    choice of x_0 by y_1 alone. Online, give y_1 to `filter.init` as well as to the first step.
+    Raises `ValueError` for a model without `log_initial`, a density in all numbers of the state,
+    whose x_0 is not made of noise either. Use it where the prior is very wide, as of a pose in a
+    building: few draws of x_0 are near a mode then, and chance decides its mass. Restarts come
+    after these steps. `num_observations` is L: as many as tell the modes.
     """
     if _has(filter, Start):
-        raise ValueError("filter: it begins by the first observations already")
-    last, initial = _last(filter), filter.initial_moves
-    grouping = tuple(m for m in initial if not isinstance(m, BeginRecent))
-    if not all(map(_regroups, initial)):
-        raise ValueError("filter: its initial moves do more than regroup, which a start replaces")
+        raise ValueError("filter: it has a start by its first observations already")
+    grouping = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
+    if not all(map(_regroups, grouping)):
+        raise ValueError("filter: its initial moves do more than regroup, and a start replaces x_0")
+    last = 1 + max(t for t, move in enumerate(filter.moves) if not _regroups(move))
     start = Start(filter.moves[:last], grouping, num_observations)
     return filter.replace(
-        moves=[start, *filter.moves[last:]], initial_moves=[*initial, Begin(num_observations)]
+        moves=[start, *filter.moves[last:]], initial_moves=[*grouping, Begin(num_observations)]
     )
 
 
 def _regroups(move: AbstractMove) -> bool:
-    """Whether it moves no particles, and at most regroups them."""
+    """Whether it changes no particles, and at most regroups them."""
     if isinstance(move, Every):
         return all(map(_regroups, move.moves))
-    return isinstance(move, AbstractRegrouping | WatchStart | Begin | BeginRecent)
+    return isinstance(move, AbstractRegrouping | WatchStart)
 
 
 @checked
 def with_restarts(
     filter: Filter,
     probability: InnerShare = 1e-3,
-    *,
-    num_observations: Count = 8,
-    num_draws: Count = 1024,
+    share: InnerShare = 1 / 4,
+    num_draws: Count = 4,
 ) -> Filter:
     """The filter that finds a state again which begins anew with a small probability: `Restart`.
 
-    Where the alarm of `with_alarm`, of `num_draws`, rings, a start by the last L observations is
-    joined to the hypotheses there are, by its evidence and p. The step where it rings costs as much
-    as 300 others. Give y_1 to `filter.init`. Of a filter with restarts it changes the settings.
-    Raises `ValueError` for a model without `log_initial` whose x_0 is not made of noise. Use it
-    where a hypothesis may be wrong for good: a robot that is carried away, a lost target.
-    `num_observations` is L.
+    At each step x_{t-1} ~ (1 - p) δ + p p_0, and Ẑ is unbiased for this kernel. Draws of x_0 have a
+    component of their own, one more than the filter has, which its regrouping leaves alone. They
+    are an alarm as well, in the place of that of `with_alarm`. Of a filter with restarts it changes
+    the settings. Raises `ValueError` for a filter that does not resample all components at each
+    step by a `Resample`. Use it where a hypothesis may be wrong for good: a robot that is carried
+    away, a lost target.
     """
-    if not all(map(_regroups, filter.initial_moves)):
-        raise ValueError("filter: its initial moves do more than regroup, which a restart replaces")
+    _require_resample(filter, "with which a state begins anew")
+    settings = {"probability": probability, "share": share, "num_draws": num_draws}
+
+    def changed(move: Any) -> Any:
+        return dataclasses.replace(move, **settings) if isinstance(move, Restart) else move
+
+    def restarting(move: Any) -> Any:
+        if isinstance(move, Start):
+            return move.map_inner(restarting)
+        is_own = isinstance(move, Resample | AuxiliaryResample)
+        return Restart(move, **settings) if is_own else _apart(move)
+
     if _has(filter, Restart):
-        raise ValueError("filter: it has restarts already")
-    if not _has(filter, WatchStart):
-        filter = with_alarm(filter, num_draws)
-    first, *others = filter.moves
-    grouping = tuple(m for m in filter.initial_moves if not isinstance(m, Begin))
-
-    def restart(moves: Sequence[Any]) -> Restart:
-        return Restart(tuple(moves), grouping, probability, num_observations)
-
-    if isinstance(first, Start):
-        moves = [dataclasses.replace(first, moves=(restart(first.moves),)), *others]
-    else:
-        last = _last(filter)
-        moves = [restart(filter.moves[:last]), *filter.moves[last:]]
-    begin = BeginRecent(num_observations)
-    return filter.replace(moves=moves, initial_moves=[*filter.initial_moves, begin])
+        return _map_chain(changed, filter)
+    return filter.replace(
+        moves=[restarting(move) for move in filter.moves if not isinstance(move, WatchStart)],
+        initial_moves=[_apart(move) for move in filter.initial_moves],
+        num_components=filter.num_components + 1,
+    )
 
 
 def _has(filter: Filter, kind: type) -> bool:
     return any(isinstance(move, kind) for move in all_of(filter.moves))
 
 
-def _last(filter: Filter) -> int:
-    """How many moves there are up to the last that does more than regroup."""
-    return 1 + max(t for t, move in enumerate(filter.moves) if not _regroups(move))
+def _apart(move: Any) -> Any:
+    """The move with its regroupings kept from the component of restarts."""
+    if isinstance(move, AbstractRegrouping):
+        return RegroupOthers(move)
+    return move.map_inner(_apart)
 
 
 @checked

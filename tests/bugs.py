@@ -257,11 +257,17 @@ BUGS = {
         "return objects[0]",
         "tests/moves/test_partitioned.py -k moved_last",
     ),
-    "a tempered start weighs by all of the likelihood": Bug(
-        "moves/initial.py",
-        "- last_power * log_factors",
-        "- log_factors",
-        "tests/test_initial.py -k searched",
+    "the cloud of a start decides its own powers": Bug(
+        "moves/start/window.py",
+        "log_mean += log_sum_exp(log_weights[:n]) - np.log(n)",
+        "log_mean += log_sum_exp(log_weights) - np.log(number)",
+        "tests/moves/start/test_window.py -k edges",
+    ),
+    "a start forgets p(x_0)": Bug(
+        "moves/start/window.py",
+        "return log_prior + paths.log_before + power * paths.log_last",
+        "return 0 * log_prior + paths.log_before + power * paths.log_last",
+        "tests/moves/start/test_window.py -k unbiased",
     ),
     "restarts forget the mass of their choice": Bug(
         "mixture.py",

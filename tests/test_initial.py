@@ -2,7 +2,6 @@
 
 from functools import cache
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,66 +87,6 @@ def test_without_an_observation_it_does_nothing():
     run, plain = (mpfjax.run_filter(KEY, make(k), gap, missing="skip") for k in (4, 1))
     np.testing.assert_array_equal(run.initial.log_weights, plain.initial.log_weights)
     assert run.initial.log_scale == 0
-
-
-# A place in the plane, anywhere, that is seen with a small error. x_0 is made of noise.
-PLANE = mpfjax.LinearGaussianModel(
-    np.eye(2), 0.01 * np.eye(2), np.eye(2), 0.09 * np.eye(2), np.zeros(2), 400 * np.eye(2)
-)
-
-
-class OnlyDraws(mpfjax.AbstractStateSpaceModel):
-    """The same, which draws x_0 and says no more of it."""
-
-    deviation: float = 20.0
-
-    def sample_initial(self, key, num_particles):
-        return self.deviation * jax.random.normal(key, (num_particles, 2))
-
-    def sample_transition(self, key, states):
-        return states + 0.1 * jax.random.normal(key, states.shape)
-
-    def log_likelihood(self, observation, states):
-        return jnp.sum(jax.scipy.stats.norm.logpdf(observation[None], states, 0.3), axis=1)
-
-
-class WithDensity(OnlyDraws):
-    """The same with a density of x_0."""
-
-    def log_initial(self, states):
-        return jnp.sum(jax.scipy.stats.norm.logpdf(states, 0.0, self.deviation), axis=1)
-
-
-PLACES = np.array([[3.0, 1.0], [3.3, 1.2], [3.1, 1.4]], np.float32)
-
-
-@pytest.mark.parametrize("model", [OnlyDraws(), WithDensity(), PLANE])
-def test_without_a_number_a_wide_prior_is_searched(model):
-    """By many draws, or from a tempered start where x_0 can be moved; 800 draws may miss y_1."""
-    keys, exact = jax.random.split(KEY, 300), kalman_filter(PLANE, PLACES)
-    squares = {}
-    for num_draws in (4, None):
-        filter = mpfjax.with_selected_start(mpfjax.particle_filter(model, 200), num_draws)
-        ratios = ratios_to(exact, mpfjax.monte_carlo(keys, filter, PLACES, nothing))
-        squares[num_draws] = np.mean((ratios - 1) ** 2)
-    assert_unbiased(ratios)
-    assert squares[None] < 0.3 * squares[4], squares
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize("kind", [OnlyDraws, WithDensity])
-def test_derivatives_of_a_wide_prior_are_those_of_its_draws_or_density(kind):
-    """The evidence falls as the square of x_0's deviation."""
-
-    @eqx.filter_jit
-    @eqx.filter_grad
-    def score(model, key):
-        filter = mpfjax.with_selected_start(mpfjax.particle_filter(model, 200))
-        return mpfjax.run_filter(key, filter, PLACES[:1], nothing).log_marginal_likelihood
-
-    model = kind(jnp.float32(200.0))
-    found = np.array([score(model, key).deviation for key in jax.random.split(KEY, 24)])
-    assert_unbiased(found, -2 / 200.0)
 
 
 def test_what_a_chain_weighs_before_it_propagates_counts():

@@ -90,7 +90,7 @@ GOOD = {
             PropagateInClusters),
     **alike({"particles_per_component": 2}, Resample, mpfjax.GaussianRegeneration),
     **alike({"filter": FILTER}, mpfjax.with_lookahead, mpfjax.with_point_sets,
-            mpfjax.with_score_gradient),
+            mpfjax.with_score_gradient, mpfjax.with_start),
     **alike({"filter": FILTER, "num_draws": 2}, mpfjax.with_selected_start,
             mpfjax.with_proposals_per_particle, mpfjax.with_restarts, mpfjax.with_alarm),
     **alike({"model": MODEL, "num_particles": 4}, mpfjax.particle_filter,

@@ -151,6 +151,13 @@ class Ring(Ranges):
         place, way = jax.random.uniform(key, (2, num_particles))
         return jnp.stack([60 * place, 0 * place, jnp.where(way < 0.5, 0.0, jnp.pi)], axis=1)
 
+    initial_noise_dimension = 2
+
+    def initial_from_noise(self, noise: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+        """x_0 of normal numbers."""
+        place, way = jax.scipy.special.ndtr(noise).T
+        return jnp.stack([60 * place, 0 * place, jnp.where(way < 0.5, 0.0, jnp.pi)], axis=1)
+
     def ranges(self, states: Float[Array, "n 3"]) -> Float[Array, "n 1"]:
         """The doors, and a niche of twice their depth 1 m behind the one at 0."""
         place = (states[:, 0] + 30) % 60 - 30

@@ -10,7 +10,7 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, no_ancestors
-from mpfjax.moves.base import AbstractMove, AbstractWrapper, Moves, Step, is_missing
+from mpfjax.moves.base import AbstractMove, AbstractWrapper, Moves, Step, as_moves, is_missing
 from mpfjax.moves.start.window import (
     Window,
     check_start,
@@ -83,11 +83,11 @@ class Start(AbstractWrapper):
     - `grouping`: of the particles in these steps; usually the initial moves.
     - `num_observations`: L.
 
-    `with_selected_start` makes a filter with it.
+    `with_start` makes a filter with it.
     """
 
-    moves: Moves
-    grouping: Moves
+    moves: Moves = eqx.field(converter=lambda moves: as_moves(moves, "moves"))
+    grouping: Moves = eqx.field(converter=lambda moves: as_moves(moves, "grouping"))
     num_observations: Count = eqx.field(static=True, default=8)
 
     holds = ("moves", "grouping")

@@ -1,4 +1,4 @@
-"""The first steps of a filter by a tempered sampler, and its restarts: exact, one at a time or not."""
+"""The first steps of a filter by a tempered sampler: exact, one at a time or not."""
 
 import equinox as eqx
 import jax
@@ -23,9 +23,8 @@ def observations():
 
 SEEN = observations()
 GAPS = np.where(np.isin(np.arange(STEPS), [0, 5])[:, None], np.nan, SEEN)
-FILTER = mpfjax.with_selected_start(
-    mpfjax.mixture_particle_filter(WithKeys(), 100, 3), num_observations=LENGTH
-)
+PLAIN = mpfjax.mixture_particle_filter(WithKeys(), 100, 3)
+FILTER = mpfjax.with_start(PLAIN, LENGTH)
 
 
 def mean(mixture):
@@ -39,10 +38,7 @@ def test_evidence_and_moments_are_unbiased_beyond_the_window():
     exact = kalman_filter(PLANE, series)
     ratios = ratios_to(exact, runs)
     assert_unbiased(ratios, loosest=0.05)
-    means = ratios[:, None, None] * np.asarray(runs.collected)
-    assert_unbiased(
-        means, np.asarray(exact.means)[-1:], slack=1e9 * (np.arange(STEPS) < 8)[:, None]
-    )
+    assert_unbiased(ratios[:, None] * np.asarray(runs.collected)[:, -1], exact.means[-1])
 
 
 def test_one_step_at_a_time_is_a_run():
@@ -60,9 +56,8 @@ def test_fewer_observations_than_the_window_has():
     run = mpfjax.run_filter(KEY, FILTER, SEEN, mean)
     short = mpfjax.run_filter(KEY, FILTER, SEEN[: LENGTH - 1], mean)
     assert np.isfinite(short.log_marginal_likelihood)
-    assert (
-        abs(short.log_marginal_likelihood - run.log_likelihood_increments[: LENGTH - 1].sum()) < 3
-    )
+    same = run.log_likelihood_increments[: LENGTH - 1].sum()
+    assert abs(short.log_marginal_likelihood - same) < 3
 
 
 @pytest.mark.exactness
@@ -79,7 +74,7 @@ def test_the_gradient_is_the_score():
     @jax.grad
     def score(scale, key):
         filter = mpfjax.particle_filter(at(scale), 150, gradient="stop")
-        filter = mpfjax.with_selected_start(filter, num_observations=LENGTH)
+        filter = mpfjax.with_start(filter, num_observations=LENGTH)
         return mpfjax.run_filter(key, filter, SEEN, mean).log_marginal_likelihood
 
     scores = [score(1.0, key) for key in jax.random.split(KEY, 30)]
@@ -95,34 +90,26 @@ def test_islands_have_the_masses_of_their_own_starts():
     assert_unbiased(ratios_to(kalman_filter(PLANE, SEEN), runs))
 
 
+@pytest.mark.exactness
+def test_restarts_begin_after_the_first_steps():
+    """In either order; they are so rare here that the exact answer is that without them."""
+    exact = kalman_filter(PLANE, SEEN)
+    both = (
+        mpfjax.with_restarts(FILTER, 1e-6),
+        mpfjax.with_start(mpfjax.with_restarts(PLAIN, 1e-6), LENGTH),
+    )
+    for filter in both:
+        runs = mpfjax.monte_carlo(jax.random.split(KEY, 200), filter, SEEN, mean)
+        assert_unbiased(ratios_to(exact, runs))
+        assert not np.asarray(runs.surprised).any()
+
+
 def test_what_cannot_begin_so_is_refused():
     with pytest.raises(ValueError, match="needs every slot"):
         mpfjax.monte_carlo(jax.random.split(KEY, 2), FILTER, SEEN, mean, slots=120)
+    with pytest.raises(ValueError, match="first observations already"):
+        mpfjax.with_start(FILTER)
+    with pytest.raises(ValueError, match="more observations than y_1"):
+        mpfjax.with_selected_start(FILTER)
     with pytest.raises(ValueError, match="defines no log_initial"):
-        mpfjax.with_selected_start(mpfjax.particle_filter(Batched(), 50))
-
-
-# Carried away after six steps; the alarm rings at once, and the start is by the next three.
-CARRIED = np.concatenate([SEEN[:6], SEEN[:6] - 12.0])
-PROBABILITY = 0.01
-
-
-def test_restarts_are_exact_for_a_state_that_began_anew():
-    plain = mpfjax.mixture_particle_filter(WithKeys(), 100, 3)
-    filter = mpfjax.with_restarts(plain, PROBABILITY, num_observations=3, num_draws=200)
-    runs = mpfjax.monte_carlo(jax.random.split(KEY, 200), filter, CARRIED, mean)
-    alone, before, after = (
-        float(kalman_filter(PLANE, part).log_marginal_likelihood)
-        for part in (CARRIED, CARRIED[:6], CARRIED[6:])
-    )
-    log_z = np.logaddexp(np.log1p(-PROBABILITY) + alone, np.log(PROBABILITY) + before + after)
-    np.testing.assert_array_equal(np.asarray(runs.surprised)[:, 6:9].all(axis=1), True)
-    assert not np.asarray(runs.surprised)[:, 9:].any()
-    # Before the alarm x_0 are plain draws, of which few are near.
-    tilts = np.asarray(runs.log_likelihood_increments)[:, 6:].sum(axis=1)
-    assert_unbiased(np.exp(tilts - (log_z - before)), loosest=0.05)
-    np.testing.assert_allclose(
-        np.asarray(runs.collected)[:, -1].mean(axis=0),
-        kalman_filter(PLANE, CARRIED[6:]).means[-1],
-        atol=0.1,
-    )
+        mpfjax.with_start(mpfjax.particle_filter(Batched(), 50))

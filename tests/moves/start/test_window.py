@@ -1,4 +1,4 @@
-"""A start by the first observations: unbiased, also with hard edges, and every mode has its mass."""
+"""A sampler of the first observations: unbiased, also with hard edges, and modes of equal mass."""
 
 import equinox as eqx
 import jax
@@ -8,7 +8,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.start.window import Window, check_start, window_start
+from mpfjax.moves.start.window import Window, check_start, window_start, with_derivatives
 from tests.unbiased import assert_unbiased
 
 KEY = jax.random.key(0)
@@ -31,7 +31,7 @@ def starts(model, window, num_particles, num_runs, key=KEY):
     return jax.tree.map(np.asarray, jax.lax.map(start, jax.random.split(key, num_runs)))
 
 
-# A place in the plane, anywhere, that is observed with a small error. x_0 and x_t are made of noise.
+# A place in the plane, anywhere, observed with a small error. x_0 and x_t are made of noise.
 PLANE = mpfjax.LinearGaussianModel(
     np.eye(2), 0.01 * np.eye(2), np.eye(2), 0.09 * np.eye(2), np.zeros(2), 400 * np.eye(2)
 )
@@ -115,7 +115,7 @@ class Rooms(WithKeys):
 
 
 def test_equal_modes_have_equal_masses():
-    """A mode is 6e-4 of the prior, so that 60 of the paths and none of the pilot hits it at first."""
+    """A mode is a thousandth of its room, so that none of the paths may hit it at first."""
     places = np.array([[0.3, 0.6]] * 4) + np.array([[0.01, -0.01], [0, 0], [0.005, 0], [0, -0.01]])
     states, _ = starts(Rooms(), window_of(places), 500, 8)
     rooms = np.floor(states).astype(int) @ [1, 3]
@@ -128,15 +128,13 @@ def test_a_model_whose_x_0_cannot_be_moved_is_refused():
     class OnlyDraws(Rooms):
         log_initial = None
 
-    with pytest.raises(ValueError, match="OnlyDraws.* defines no log_initial"):
+    with pytest.raises(ValueError, match=r"OnlyDraws.* defines no log_initial"):
         check_start(OnlyDraws(), "a start needs it")
 
 
 @pytest.mark.exactness
 def test_the_paths_have_the_score_of_what_was_observed():
     """Fisher's identity, beside the derivative of the Kalman filter's log-likelihood."""
-    from mpfjax.moves.start.window import with_derivatives
-
     window = window_of(PLACES, PRESENT)
 
     def log_z(scale):
