@@ -62,10 +62,11 @@ def test_fewer_observations_than_the_window_has():
 
 @pytest.mark.exactness
 def test_the_gradient_is_the_score():
-    """Fisher's identity in the window; beyond it gradient "stop"."""
+    """Of the increments of all first steps together, by Fisher's identity."""
+    first = SEEN[:LENGTH]
 
     def log_z(scale):
-        return kalman_filter(at(scale), SEEN).log_marginal_likelihood
+        return kalman_filter(at(scale), first).log_marginal_likelihood
 
     def at(scale):
         return eqx.tree_at(lambda m: m.P0, PLANE, scale * PLANE.P0)
@@ -73,12 +74,11 @@ def test_the_gradient_is_the_score():
     @jax.jit
     @jax.grad
     def score(scale, key):
-        filter = mpfjax.particle_filter(at(scale), 150, gradient="stop")
-        filter = mpfjax.with_start(filter, num_observations=LENGTH)
-        return mpfjax.run_filter(key, filter, SEEN, mean).log_marginal_likelihood
+        filter = mpfjax.with_start(mpfjax.particle_filter(at(scale), 150), LENGTH)
+        return mpfjax.run_filter(key, filter, first, mean).log_marginal_likelihood
 
-    scores = [score(1.0, key) for key in jax.random.split(KEY, 30)]
-    assert_unbiased(scores, float(jax.grad(log_z)(1.0)), loosest=0.05, slack=0.05)
+    scores = [score(1.0, key) for key in jax.random.split(KEY, 20)]
+    assert_unbiased(scores, float(jax.grad(log_z)(1.0)), loosest=0.25)
 
 
 @pytest.mark.exactness
