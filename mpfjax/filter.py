@@ -18,7 +18,6 @@ from mpfjax.moves.base import (
     AbstractMove,
     AbstractPropagation,
     AbstractPropagationOfEach,
-    AbstractRegrouping,
     Moves,
     Step,
     all_of,
@@ -195,8 +194,7 @@ class Filter(eqx.Module):
         mixture = mixture.replace(memory=memory_of(self.moves, self.model, self.num_components))
         now = self._now(observation, is_initial=True)
         for move_key, move in zip(keys, self.initial_moves, strict=True):
-            # Those that regroup x_0 need no observation.
-            mixture = move(move_key, mixture, None if isinstance(move, AbstractRegrouping) else now)
+            mixture = move(move_key, mixture, now)
         if self.weighs_initially:
             mixture, log_mass = mixture.normalised(mixture)
             mixture = mixture.replace(log_scale=log_mass, waits=log_mass != 0)

@@ -30,11 +30,17 @@ TRANSFORMS = {
     "alarm": lambda filter: mpfjax.with_alarm(filter, 16),
     "stratified": lambda filter: mpfjax.with_resampling(filter, Resample("stratified")),
 }
+# A start by y_1 alone, after which restarts are those of a filter without it.
+FIRST = "first observations"
 NUM_RUNS, NUM_ISLANDS = 1500, 2
 # In either order on one device, and in one on islands.
 PAIRS = [(*pair, 1) for pair in itertools.permutations(TRANSFORMS, 2)]
 PAIRS += [("restarts", "restarts", 1), ("alarm", "alarm", 1)]
 PAIRS += [(*pair, NUM_ISLANDS) for pair in itertools.combinations(TRANSFORMS, 2)]
+BESIDE_FIRST = ("look-ahead", "restarts", "point sets")
+PAIRS += [(*pair, 1) for name in BESIDE_FIRST for pair in ((FIRST, name), (name, FIRST))]
+PAIRS += [(FIRST, "restarts", NUM_ISLANDS)]
+TRANSFORMS[FIRST] = lambda filter: mpfjax.with_start(filter, 1)
 # Each kind of fault that there was: looks ahead, starts and islands beside restarts.
 QUICK = [("look-ahead", "restarts", 1), ("start", "look-ahead", 1), ("start", "restarts", 2)]
 

@@ -1,12 +1,13 @@
 """A start by the first observations, in place of draws of x_0 that few of them fit."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array, Key
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, no_ancestors
@@ -125,9 +126,15 @@ class Start(AbstractWrapper):
 
         if START not in mixture.memory:
             return as_ever()
-        return cond_if_any(
-            self._is_first(mixture), lambda: self._observed(key, mixture, now), as_ever
-        )
+        # Runs of one `vmap` may be at different steps, and each kind of step runs if any needs it.
+        is_first, same = self._is_first(mixture), mixture.replace(in_order=False)
+        later = cond_if_any(~is_first, as_ever, lambda: same)
+
+        def observed() -> ParticleMixture:
+            first = self._observed(key, mixture, now)
+            return jax.tree.map(lambda new, old: jnp.where(is_first, new, old), first, later)
+
+        return cond_if_any(is_first, observed, lambda: later)
 
     def _observed(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step
@@ -152,11 +159,13 @@ class Start(AbstractWrapper):
             ancestor_indices=no_ancestors(mixture),
             memory=mixture.memory | {START: memory},
         )
-        return in_turn(key_group, self.grouping, moved, None)
+        # Regrouping x_0 waits for no observation.
+        at_start = dataclasses.replace(now, is_initial=True)
+        return in_turn(key_group, self.grouping, moved, at_start)
 
 
 def in_turn(
-    key: Key[Array, ""], moves: Moves, mixture: ParticleMixture, now: PyTree
+    key: Key[Array, ""], moves: Moves, mixture: ParticleMixture, now: Step
 ) -> ParticleMixture:
     """The mixture after the moves, one after the other."""
     for move_key, move in zip(split(key, len(moves)), moves, strict=True) if moves else ():

@@ -1,13 +1,17 @@
 """The first steps of a filter by a tempered sampler: exact, one at a time or not."""
 
+import chex
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
+from mpfjax.smoothing import conditional_filter, sample_trajectories, with_first_ancestors
 from tests.moves.start.test_window import PLANE, WithKeys
+from tests.test_inputs import INPUTS, OBSERVATIONS, Driven, truth
 from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import Batched
 
@@ -58,6 +62,57 @@ def test_fewer_observations_than_the_window_has():
     assert np.isfinite(short.log_marginal_likelihood)
     same = run.log_likelihood_increments[: LENGTH - 1].sum()
     assert abs(short.log_marginal_likelihood - same) < 3
+
+
+def test_a_checkpoint_within_the_window_goes_on_to_the_bit(tmp_path):
+    mixture, _ = FILTER.step(KEY, FILTER.init(KEY, SEEN[0]), SEEN[0])
+    mpfjax.save_checkpoint(tmp_path / "first.npz", mixture)
+    loaded = mpfjax.load_checkpoint(tmp_path / "first.npz", like=mixture)
+    both = [FILTER.step(KEY, each, SEEN[1])[0] for each in (mixture, loaded)]
+    chex.assert_trees_all_equal(*both)
+
+
+def test_runs_at_different_steps_are_as_alone():
+    """One is within the window, and one beyond it."""
+    mixtures = [FILTER.init(KEY, SEEN[0])]
+    for y in SEEN[: LENGTH + 1]:
+        mixtures.append(FILTER.step(KEY, mixtures[-1], y)[0])
+    pair = [mixtures[1], mixtures[-1]]
+    together = jax.vmap(lambda mixture: FILTER.step(KEY, mixture, SEEN[1])[0])(
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *pair)
+    )
+    for run, mixture in enumerate(pair):
+        alone, _ = FILTER.step(KEY, mixture, SEEN[1])
+        np.testing.assert_allclose(together.mean()[run], alone.mean(), rtol=1e-4)
+
+
+@pytest.mark.exactness
+def test_inputs_of_each_step_are_those_of_the_window():
+    log_z, filtered, _ = truth()
+    filter = mpfjax.with_start(mpfjax.particle_filter(Driven(), 100), LENGTH)
+    series = mpfjax.Series(OBSERVATIONS, INPUTS)
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 300), filter, series, mean)
+    ratios = ratios_to(log_z, runs)
+    assert_unbiased(ratios, loosest=0.03)
+    assert_unbiased(ratios[:, None] * np.asarray(runs.collected), filtered, loosest=0.05)
+
+
+@pytest.mark.exactness
+def test_trajectories_are_drawn_backwards_and_ancestors_refused():
+    filter = mpfjax.with_start(mpfjax.particle_filter(Driven(), 200), LENGTH)
+    series = mpfjax.Series(OBSERVATIONS, INPUTS)
+
+    @jax.jit
+    @jax.vmap
+    def smooth(key):
+        run = mpfjax.run_filter(key, filter, series)
+        return sample_trajectories(key, Driven(), run, 100, inputs=INPUTS).mean(axis=0)
+
+    assert_unbiased(smooth(jax.random.split(KEY, 40)), truth()[2], loosest=0.05, slack=0.02)
+    with pytest.raises(ValueError, match="one parent"):
+        with_first_ancestors(filter)
+    with pytest.raises(ValueError, match="cannot keep a trajectory"):
+        conditional_filter(KEY, filter, series, jnp.zeros(len(OBSERVATIONS) + 1))
 
 
 @pytest.mark.exactness
