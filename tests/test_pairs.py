@@ -17,8 +17,16 @@ from tests.marking import quick_of
 from tests.unbiased import assert_unbiased
 from tests.user_models import ScalarLinear
 
+
+class WithDensity(ScalarLinear):
+    """With the density of x_0, by which a start moves it."""
+
+    def log_initial(self, states):
+        return jax.scipy.stats.norm.logpdf(states, self.m, self.p)
+
+
 A, Q, R, M0, P0 = 0.9, 0.6, 0.5, 0.5, 1.0
-MODEL = ScalarLinear(a=A, q=Q, r=R, m=M0, p=P0)
+MODEL = WithDensity(a=A, q=Q, r=R, m=M0, p=P0)
 OBSERVATIONS = np.array([0.6, np.nan, -1.1, 1.2], np.float32)
 PROBABILITY = 0.2
 TRANSFORMS = {
