@@ -43,11 +43,14 @@ class SmoothedSums(eqx.Module):
     - `terms`: leaves (t, ...), the estimates of E[h(x_{r-1}, x_r) | y_1..y_{min(r + lag, t)}] for
       every r; None without a lag.
     - `run`: the `FilterRun`, with nothing collected.
+    - `variances`: of the values of h whose expectations `terms` are, about these; None without a
+      lag.
     """
 
     sums: PyTree
     terms: PyTree
     run: FilterRun
+    variances: PyTree = None
 
 
 @checked
@@ -93,7 +96,7 @@ def smoothed_sums(
     smoother = FixedLagSmoother(filter, function, lag or 0, method, num_draws)
     smooth = lambda smoother: _smooth(key, smoother, series, lag)  # noqa: E731
     sums = with_floats_traced(smooth, smoother)
-    return SmoothedSums(sums.sums, sums.terms, sound(sums.run))
+    return eqx.tree_at(lambda sums: sums.run, sums, sound(sums.run))
 
 
 @jit_on_wide_vectors
@@ -104,23 +107,26 @@ def _smooth(key, smoother, series, lag):
     step_keys = jax.random.split(key_steps, length)
     initial = first_mixture(key_initial, filter, series)
     kept = smoother._no_terms(initial.particles)
-    settled = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[2:], leaf.dtype), kept)
+    settled = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[2:], leaf.dtype), kept.means)
 
-    def advance(carry: tuple[ParticleMixture, PyTree, PyTree], step: PyTree) -> Any:
+    def advance(carry: tuple[ParticleMixture, "Terms", PyTree], step: PyTree) -> Any:
         mixture, kept, settled = carry
         t, step_key, draw_key, now = step
         moved, info = step_or_predict(filter, step_key, mixture, now)
         kept, values = smoother._of_pasts(draw_key, now.inputs, mixture, moved, kept)
         if lag is None:
-            kept = jax.tree.map(lambda old, new: old + new[None], kept, values)
+            means = jax.tree.map(lambda old, new: old + new[None], kept.means, values.means)
+            kept = kept._replace(means=means)
         else:
             kept = jax.tree.map(lambda old, new: old.at[t % num_kept].set(new), kept, values)
-        averages = jax.tree.map(jax.vmap(moved.average), kept)
+        averages = jax.tree.map(jax.vmap(moved.average), kept.means)
         sums = jax.tree.map(lambda done, own: done + jnp.sum(own, axis=0), settled, averages)
         # The next step overwrites term t - lag; zero while there is none yet.
-        oldest = jax.tree.map(lambda own: own[(t + 1) % num_kept], averages)
+        last = (t + 1) % num_kept
+        oldest = jax.tree.map(lambda own: own[last], averages)
         if lag is not None:
             settled = jax.tree.map(jnp.add, settled, oldest)
+        oldest = Terms(oldest, kept.row(last).variances_in(moved))
         return (moved, kept, settled), (sums, oldest, report_of(info))
 
     keys = step_keys, jax.random.split(key_backward, length)
@@ -128,14 +134,36 @@ def _smooth(key, smoother, series, lag):
     carry, outputs = jax.lax.scan(advance, (initial, kept, settled), steps)
     final, kept, _ = carry
     sums, oldest, reports = outputs
-    terms = None
-    if lag is not None:
-        last = np.arange(length - lag, length) % num_kept
-        open_terms = jax.tree.map(lambda leaf: jax.vmap(final.average)(leaf[last]), kept)
-        terms = jax.tree.map(
-            lambda done, rest: jnp.concatenate([done[lag:], rest]), oldest, open_terms
-        )
-    return SmoothedSums(sums, terms, run_of(initial, final, None, reports))
+    if lag is None:
+        return SmoothedSums(sums, None, run_of(initial, final, None, reports))
+    rest = jax.vmap(lambda r: kept.row(r).estimates_in(final))(
+        np.arange(length - lag, length) % num_kept
+    )
+    terms = jax.tree.map(lambda done, rest: jnp.concatenate([done[lag:], rest]), oldest, rest)
+    return SmoothedSums(sums, terms.means, run_of(initial, final, None, reports), terms.variances)
+
+
+class Terms(NamedTuple):
+    """Moments of h(x_{r-1}, x_r) given x_t and y_1..y_t: its mean, and its variance about it.
+
+    By particle they have leaves (any, n, ...). The means vary among particles too.
+    """
+
+    means: PyTree
+    variances: PyTree
+
+    def row(self, r: Any) -> "Terms":
+        """One of the terms."""
+        return jax.tree.map(lambda leaf: leaf[r], self)
+
+    def variances_in(self, mixture: ParticleMixture) -> PyTree:
+        """Over all particles: the variance of the means, and the mean of the variances."""
+        both = lambda mean, variance: mixture.variance(mean) + mixture.average(variance)  # noqa: E731
+        return jax.tree.map(both, *self)
+
+    def estimates_in(self, mixture: ParticleMixture) -> "Terms":
+        """The moments over all particles of a mixture."""
+        return Terms(jax.tree.map(mixture.average, self.means), self.variances_in(mixture))
 
 
 class Window(NamedTuple):
@@ -143,9 +171,9 @@ class Window(NamedTuple):
 
     mixture: ParticleMixture
     """the filter's, at t."""
-    terms: PyTree
-    """E[h(x_{r-1}, x_r) | x_t, y_1..y_t] of each particle, for r of the last L + 1 steps: leaves
-    (L + 1, n, ...), term r in row (r - 1) mod (L + 1)."""
+    terms: Terms
+    """of each particle, for r of the last L + 1 steps: leaves (L + 1, n, ...), term r in row
+    (r - 1) mod (L + 1)."""
     num_steps: Int[Array, ""]
     """t, from the start on."""
 
@@ -206,11 +234,19 @@ class FixedLagSmoother(Checked):
         inputs = one_input(inputs, self.filter.model)
         return *_advanced(self, key_draws, window, moved, inputs), info
 
-    def _no_terms(self, states: PyTree) -> PyTree:
+    def variances(self, window: Window) -> PyTree:
+        """Var[h(x_{r-1}, x_r) | y_1..y_t] for the r of the estimates, of each number apart.
+
+        It is about the mean: E[h²] - E[h]² would be rounding alone where h is far from zero.
+        """
+        return _estimates(self, window).variances
+
+    def _no_terms(self, states: PyTree) -> Terms:
         """Zeros for the terms of the first steps, of which there are none: (L + 1, n, ...)."""
         shapes = jax.eval_shape(self._of_states, states, states)
         zeros = lambda leaf: jnp.zeros((self.lag + 1, *leaf.shape), leaf.dtype)  # noqa: E731
-        return jax.tree.map(zeros, shapes)
+        terms = jax.tree.map(zeros, shapes)
+        return Terms(terms, jax.tree.map(jnp.real, terms))
 
     def _of_pasts(
         self,
@@ -218,9 +254,9 @@ class FixedLagSmoother(Checked):
         inputs: PyTree,
         mixture: ParticleMixture,
         moved: ParticleMixture,
-        terms: PyTree,
-    ) -> tuple[PyTree, PyTree]:
-        """Terms of the particles at t - 1 as means over the pasts of those at t; and h of the step.
+        terms: Terms,
+    ) -> tuple[Terms, Terms]:
+        """Terms of the particles at t - 1, over the pasts of those at t; and h of the step.
 
         Leaves of the first are (any, n, ...) as they were, of the second (n, ...).
         """
@@ -242,9 +278,10 @@ class FixedLagSmoother(Checked):
         earlier = jax.tree.map(lambda leaf: take(leaf, places), mixture.particles)
         repeat = lambda leaf: jnp.repeat(leaf, num_draws, axis=0)  # noqa: E731
         values = self._of_states(earlier, jax.tree.map(repeat, moved.particles))
-        values = jax.tree.map(lambda leaf: _mean_of_pasts(leaf, num_draws), values)
-        of_pasts = jax.vmap(lambda rows: _mean_of_pasts(take(rows, places), num_draws))
-        return jax.tree.map(of_pasts, terms), values
+        no_spread = jax.tree.map(lambda leaf: jnp.zeros_like(jnp.real(leaf)), values)
+        of_rows = lambda rows: jax.tree.map(lambda leaf: take(leaf, places), rows)  # noqa: E731
+        of_pasts = jax.vmap(lambda rows: _over_draws(of_rows(rows), num_draws))
+        return of_pasts(terms), _over_draws(Terms(values, no_spread), num_draws)
 
     def _of_states(self, previous: PyTree, states: PyTree) -> PyTree:
         """h of these states; a `ValueError` unless it is one value a particle."""
@@ -254,21 +291,33 @@ class FixedLagSmoother(Checked):
         return jax.tree.map(as_inexact, values)
 
 
-def _mean_of_pasts(values: Array, num_draws: int) -> Array:
-    """For each particle the mean of its draws, which stand side by side."""
-    return jnp.mean(values.reshape(-1, num_draws, *values.shape[1:]), axis=1)
+def _over_draws(terms: Terms, num_draws: int) -> Terms:
+    """The moments over each particle's draws, which stand side by side."""
+    draws = jax.tree.map(lambda leaf: leaf.reshape(-1, num_draws, *leaf.shape[1:]), terms)
+    means, within = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=1), draws)
+    between = lambda each, mean: jnp.mean(jnp.abs(each - mean[:, None]) ** 2, axis=1)  # noqa: E731
+    return Terms(means, jax.tree.map(jnp.add, within, jax.tree.map(between, draws.means, means)))
 
 
 @jit_with_floats_traced
 def _advanced(smoother: Any, key: Any, window: Window, moved: ParticleMixture, inputs: PyTree):
     """The next window, and the estimates."""
     terms, values = smoother._of_pasts(key, inputs, window.mixture, moved, window.terms)
-    t, num_kept = window.num_steps, smoother.lag + 1
-    terms = jax.tree.map(lambda old, new: old.at[t % num_kept].set(new), terms, values)
-    steps = t - smoother.lag + jnp.arange(num_kept, dtype=t.dtype)
+    t = window.num_steps
+    row = t % (smoother.lag + 1)
+    terms = jax.tree.map(lambda old, new: old.at[row].set(new), terms, values)
+    window = Window(moved, terms, t + 1)
+    return window, _estimates(smoother, window).means
 
-    def estimates(leaf: Array) -> Array:
-        average = lambda r: jnp.where(r < 0, jnp.nan, moved.average(leaf[r % num_kept]))  # noqa: E731
-        return jax.vmap(average)(steps)
 
-    return Window(moved, terms, t + 1), jax.tree.map(estimates, terms)
+@jit_with_floats_traced
+def _estimates(smoother: Any, window: Window) -> Terms:
+    """The moments of r = t - L, ..., t, NaN for those before the first step."""
+    num_kept = smoother.lag + 1
+    steps = window.num_steps - num_kept + jnp.arange(num_kept, dtype=window.num_steps.dtype)
+
+    def of_step(r: Array) -> Terms:
+        estimates = window.terms.row(r % num_kept).estimates_in(window.mixture)
+        return jax.tree.map(lambda leaf: jnp.where(r < 0, jnp.nan, leaf), estimates)
+
+    return jax.vmap(of_step)(steps)
