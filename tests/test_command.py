@@ -402,6 +402,22 @@ def test_a_late_clip_begins_at_its_first_row_and_a_far_row_is_named(tmp_path, ca
     assert not (tmp_path / "far").exists()
 
 
+def test_classes_scores_and_the_seconds_of_the_lost_go_through_to_what_is_written(tmp_path):
+    """Two boxes of two classes; the second is away for a second and a half."""
+    rows = np.tile(np.c_[two_walkers(1), [0.5, 0.75], [1, 2]], (40, 1))
+    rows[:, 0] = np.repeat(np.arange(1, 41), 2)
+    away = (rows[:, 7] == 2) & (rows[:, 0] > 10) & (rows[:, 0] <= 25)
+    found = write_detections(tmp_path / "found.txt", rows[~away])
+    numbers = {}
+    for name, options in {"short": (), "long": ("--lost-seconds", 2)}.items():
+        out = tmp_path / name
+        assert run(found, "--classes", "--format", "csv", "--fps", 10, "--out", out, *options) == 0
+        written = np.loadtxt(out / "tracks.csv", delimiter=",", skiprows=1)
+        np.testing.assert_array_equal(written[:, 6], written[:, 7] / 4 + 0.25)
+        numbers[name] = len(np.unique(written[written[:, 7] == 2, 1]))
+    assert numbers == {"short": 2, "long": 1}
+
+
 def test_frames_with_more_objects_than_room_are_counted(tmp_path, capsys):
     assert Rows(still_objects(150, 3)).most_objects() >= 200
     path = write_detections(tmp_path / "crowd.txt", still_objects(5, 4))

@@ -39,13 +39,22 @@ examples:
 
 SOURCE = "a video, a folder of images, or detections: a file of them, or a folder with det.txt"
 TRACKS, VIDEO, SUMMARY = OUTPUTS = ("tracks.txt", "tracking.mp4", "summary.json")
+FORMATS = {"mot": TRACKS, "coco": "tracks.json", "csv": "tracks.csv"}
 SCORES = ("HOTA", "MOTA", "IDF1")
 NO_SCORES = "no HOTA, MOTA and IDF1"
 _INNER = ("img", "img1")
 _TEXT = (".txt", ".csv")
 _NOT_WITH = {
-    "box": ("max_objects", "min_score", "no_colour", "camera_motion", "offline"),
-    "detect": ("min_score",),
+    "box": (
+        "max_objects",
+        "min_score",
+        "no_colour",
+        "camera_motion",
+        "offline",
+        "lost_seconds",
+        "classes",
+    ),
+    "detect": ("min_score", "classes"),
 }
 
 
@@ -98,12 +107,21 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
     )
     track.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
     track.add_argument("--seed", type=seed, default=0, help="of the random numbers")
+    track.add_argument(
+        "--classes", action="store_true", help="the eighth column of detections is their class"
+    )
     track.add_argument("--min-score", type=finite, metavar="S", help="leave out weaker detections")
     track.add_argument(
         "--max-objects", type=whole(1, 1024), metavar="M", help="room for objects at a time"
     )
     track.add_argument(
         "--fps", type=positive, metavar="F", help="frames a second, where the source does not say"
+    )
+    track.add_argument(
+        "--lost-seconds",
+        type=positive,
+        metavar="T",
+        help="an object ends after so long without a detection; by default after a second",
     )
     track.add_argument(
         "--no-colour", action="store_true", help="track the detections alone, without pixels"
@@ -116,6 +134,12 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
     truth = "gt.txt to score with, where none is beside img/"
     track.add_argument("--truth", type=_existing, metavar="FILE", help=truth)
     track.add_argument("--no-video", action="store_true", help="do not draw tracking.mp4")
+    track.add_argument(
+        "--format",
+        choices=tuple(FORMATS),
+        default="mot",
+        help="coco and csv write tracks.json or tracks.csv beside tracks.txt",
+    )
     track.add_argument(
         "--offline",
         action="store_true",
@@ -153,13 +177,16 @@ def open_source(options: argparse.Namespace) -> Source:
     first, last = frames.parse_range(options.frames, "--frames")
     path, has_pixels = options.source, _has_pixels(options.source)
     detections = options.detections if has_pixels else _detections_alone(options)
-    written = [name for name in OUTPUTS if name != VIDEO or (has_pixels and not options.no_video)]
+    unwritten = () if has_pixels and not options.no_video else (VIDEO,)
+    written = [name for name in (*OUTPUTS, FORMATS[options.format]) if name not in unwritten]
     check_outputs(
         options.out,
         written,
         {"SOURCE": path, "--detections": detections, "--truth": options.truth},
     )
-    rows = None if detections is None else box_files.read_detections(detections)
+    rows = None
+    if detections is not None:
+        rows = box_files.read_detections(detections, with_classes=options.classes)
     folder, info = path, SequenceInfo()
     if not has_pixels:
         folder = path if path.is_dir() else sequence_of(path) or path

@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mpfjax.command.arguments import (
+    FORMATS,
     NO_SCORES,
     SCORES,
     SUMMARY,
@@ -54,7 +55,7 @@ class Results:
 
     def add(self, tracks: Tracks) -> np.ndarray:
         """Keep a frame's tracks, and return its rows."""
-        rows = online_rows(self.source.first + self.num_frames, tracks)
+        rows = online_rows(self.source.first + self.num_frames, tracks, described=True)
         self.rows.append(rows)
         if self.options.offline:
             self.kept.append(tracks)
@@ -64,10 +65,10 @@ class Results:
         return rows
 
     def all_rows(self) -> np.ndarray:
-        """The rows of tracks.txt."""
+        """The rows of tracks.txt, with scores and classes."""
         if self.options.offline:
-            return offline_rows(self.kept, self.source.first)
-        return np.concatenate([np.zeros((0, 6)), *self.rows])
+            return offline_rows(self.kept, self.source.first, described=True)
+        return np.concatenate([np.zeros((0, 8)), *self.rows])
 
     def summary(self) -> dict[str, Any]:
         """The content of summary.json."""
@@ -83,7 +84,7 @@ class Results:
             "peak_memory_mb": round(peak_memory(), 1),
         }
         first = self.source.first
-        return summary | scores_of(rows, self.source.truth, first, first + n - 1, self.drawn)
+        return summary | scores_of(rows[:, :6], self.source.truth, first, first + n - 1, self.drawn)
 
 
 def scores_of(
@@ -134,7 +135,8 @@ def run(options: argparse.Namespace) -> None:
     finally:
         # Also after an interruption, or where the next frame cannot be read.
         if results.num_frames:
-            box_files.write_tracks(options.out / TRACKS, results.all_rows())
+            for name in {TRACKS, FORMATS[options.format]}:
+                box_files.write_tracks(options.out / name, results.all_rows())
             summary = results.summary()
             write_json(options.out / SUMMARY, summary)
             print(_table(summary))
@@ -157,7 +159,9 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
     rows = None if source.rows is None else Rows(source.rows, last=source.last)
     room = LEAST_ROOM if rows is None else rows.most_objects()
     rate = source.frames_per_second
-    tracker = ObjectTracker(options.max_objects or room, frames_per_second=rate)
+    tracker = ObjectTracker(
+        options.max_objects or room, frames_per_second=rate, lost_seconds=options.lost_seconds
+    )
     detector = BackgroundSubtraction() if options.detect else None
     if options.camera_motion == "pixels":
         OpticalFlow()  # an error before anything is written, where OpenCV is missing

@@ -290,7 +290,7 @@ def said(identities, confirmed, shown):
     unseen = np.zeros(len(identities), int)
     return Tracks(
         boxes, np.array(identities), np.array(confirmed), unseen, np.array(False), np.array(shown),
-        np.full(len(identities), -1), np.zeros(len(identities)), unseen,
+        np.full(len(identities), -1), np.zeros(len(identities)), unseen, np.ones(len(identities)),
     )  # fmt: skip
 
 
@@ -306,6 +306,7 @@ def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_
     offline = offline_rows(kept, 5)
     assert offline[:, :2].tolist() == [[5, 1], [6, 1]]
     assert offline_rows([]).shape == (0, 6)
+    assert online_rows(6, kept[1], described=True).tolist() == [[6, 1, 8, 16, 4, 8, 1, 0]]
 
 
 @pytest.mark.exactness

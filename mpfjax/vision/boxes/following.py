@@ -202,5 +202,6 @@ def _advance_boxes(
     unseen = jnp.zeros(num_objects, jnp.int32)
     none, never = jnp.full(num_objects, -1, jnp.int32), jnp.zeros(num_objects)
     full = jnp.zeros((), bool)
-    tracks = Tracks(means[best], identities, held, unseen, full, held, none, never, unseen)
+    told = full, held, none, never, unseen, jnp.ones(num_objects)
+    tracks = Tracks(means[best], identities, held, unseen, *told)
     return mixture, tracks, faults

@@ -1,6 +1,9 @@
 """Boxes as users and MOTChallenge files write them: (x, y) of the top-left corner, w, h."""
 
 import codecs
+import csv
+import io
+import json
 import re
 from pathlib import Path
 
@@ -79,45 +82,87 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     return np.array([row[:6] for row in rows])
 
 
-def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
+def read_detections(
+    path: str | Path, *, with_classes: bool = False
+) -> Float[np.ndarray, "rows columns"]:
     """Read a MOTChallenge file of detections into rows (frame, id, x, y, w, h, score).
 
     The id, -1 in such files, has no meaning. For a file of six columns, without scores, the result
-    has six columns too. Separators, comments and headers are those of `read_tracks`. Raises
-    `ValueError` with the file and the line for a row that cannot be parsed, holds a number that is
-    not finite, lies in a frame before 1, or has a score where other rows have none; and for a file
-    without any detection.
+    has six columns too. With `with_classes` the eighth column is the class, a whole number, 0 for
+    none, and the result has eight. Separators, comments and headers are those of `read_tracks`.
+    Raises `ValueError` with the file and the line for a row that cannot be parsed, holds a number
+    that is not finite, lies in a frame before 1, has a score where other rows have none, or a class
+    that is none; and for a file without any detection.
     """
+    width, columns = 7, range(6, 11)
     form = "frame,id,x,y,w,h,score and up to three more columns, as the lines before it"
-    found = read_rows(path, form, range(6, 11), holds="detections")
-    rows = [row[:7] for row in found.values()]
+    if with_classes:
+        width, columns, form = 8, range(8, 11), "frame,id,x,y,w,h,score,class, from 0 on"
+    found = read_rows(path, form, columns, holds="detections")
+    rows = [row[:width] for row in found.values()]
     for number, row in zip(found, rows, strict=True):
-        if len(row) != len(rows[0]) or not np.all(np.isfinite(row)):
+        is_class = all(each >= 0 and each % 1 == 0 for each in row[7:])
+        if len(row) != len(rows[0]) or not np.all(np.isfinite(row)) or not is_class:
             raise ValueError(f"{path}, line {number}: {shown(row)} is not {form}")
     return np.array(rows)
 
 
-def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows 6"]) -> None:
-    """Write rows (frame, id, x, y, w, h) in MOTChallenge form, in the order of the frames.
+def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows columns"]) -> None:
+    """Write rows (frame, id, x, y, w, h), and a score and a class where there are eight columns.
 
-    Raises `ValueError` for rows that `read_tracks` could not read: rows that are not six finite
-    numbers, or with a frame or an id that is not a whole number, from 1 and 0 on.
+    They are written in the order of the frames, by the ending of `path`: `.json` in the form of
+    COCO, with a `track_id` for each annotation; `.csv` with a header; any other in that of
+    MOTChallenge. Raises `ValueError` for rows that `read_tracks` could not read: rows that are not
+    six or eight finite numbers, or with a frame, an id or a class that is not a whole number, from
+    1, 0 and 0 on.
     """
-    rows = to_rows(6, "rows", rows)
+    width = 8 if np.shape(rows)[-1:] == (8,) else 6
+    rows, whole = to_rows(width, "rows", rows), [0, 1, 7] if width == 8 else [0, 1]
     for row in rows:
-        if not np.all(np.isfinite(row)) or np.any(row[:2] < [1, 0]) or np.any(row[:2] % 1):
-            raise ValueError(f"rows: {shown(row)} is not frame,id,x,y,w,h")
+        counts = row[whole] - np.eye(len(whole))[0]
+        if not np.isfinite(row).all() or (counts < 0).any() or (counts % 1).any():
+            raise ValueError(f"rows: {shown(row)} is not frame,id,x,y,w,h, or with score,class")
     ordered = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
-    Path(path).write_text(format_tracks(ordered), encoding="utf-8")
+    form = {".json": _as_coco, ".csv": _as_csv}.get(Path(path).suffix.lower(), format_tracks)
+    Path(path).write_text(form(ordered), encoding="utf-8")
 
 
-def format_tracks(rows: Float[np.ndarray, "rows 6"]) -> str:
-    """The lines of rows (frame, id, x, y, w, h) in MOTChallenge form."""
-    lines = [
-        f"{int(frame)},{int(track)},{x:.3f},{y:.3f},{w:.3f},{h:.3f},1,-1,-1,-1\n"
-        for frame, track, x, y, w, h in rows
-    ]
-    return "".join(lines)
+def format_tracks(rows: Float[np.ndarray, "rows columns"]) -> str:
+    """The lines of rows (frame, id, x, y, w, h), or with score and class, in MOTChallenge form."""
+    return "".join(
+        f"{int(frame)},{int(track)},{x:.3f},{y:.3f},{w:.3f},{h:.3f}"
+        f",{score:g},{int(kind) or -1},-1,-1\n"
+        for frame, track, x, y, w, h, score, kind in _described(rows)
+    )
+
+
+def _described(rows: np.ndarray) -> np.ndarray:
+    """With a score of 1 and no class, where there are none."""
+    return np.hstack([rows, np.tile([1.0, 0.0], (len(rows), 1))])[:, :8]
+
+
+def _as_csv(rows: np.ndarray) -> str:
+    lines = csv.writer(file := io.StringIO(), lineterminator="\n")
+    lines.writerow(("frame", "id", "x", "y", "w", "h", "score", "class"))
+    for frame, track, *numbers, kind in _described(rows).tolist():
+        lines.writerow((int(frame), int(track), *(f"{each:.7g}" for each in numbers), int(kind)))
+    return file.getvalue()
+
+
+def _as_coco(rows: np.ndarray) -> str:
+    """One annotation for each row; categories are the classes, of which 0 is that of all others."""
+    rows = _described(rows)
+    annotations = [
+        {
+            "id": number, "image_id": int(frame), "category_id": int(kind), "track_id": int(track),
+            "bbox": [x, y, w, h], "area": w * h, "iscrowd": 0, "score": score,
+        }
+        for number, (frame, track, x, y, w, h, score, kind) in enumerate(rows.tolist(), 1)
+    ]  # fmt: skip
+    frames, kinds = (sorted(set(rows[:, column].astype(int).tolist())) for column in (0, 7))
+    images = [{"id": frame, "file_name": f"{frame:06d}.jpg"} for frame in frames]
+    categories = [{"id": kind, "name": f"class {kind}" if kind else "object"} for kind in kinds]
+    return json.dumps({"images": images, "annotations": annotations, "categories": categories})
 
 
 def read_rows(

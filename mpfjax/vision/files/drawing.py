@@ -46,9 +46,9 @@ def draw_points(
 
 
 def with_tracks(
-    frame: UInt8[np.ndarray, "h w 3"], rows: Float[np.ndarray, "k 6"]
+    frame: UInt8[np.ndarray, "h w 3"], rows: Float[np.ndarray, "k columns"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A copy of a frame with the boxes of rows (frame, id, x, y, w, h), and their ids above.
+    """A copy of a frame with the boxes of rows (frame, id, x, y, w, h, ...), their ids above.
 
     An id keeps its colour.
     """
@@ -59,7 +59,7 @@ def with_tracks(
     size = 8 + 4 * thickness
     font = ImageFont.load_default(size)
     for row in rows:
-        number, box = int(row[1]), row[2:]
+        number, box = int(row[1]), row[2:6]
         draw_box(draw, box, number, thickness)
         place = (max(box[0], 0), max(box[1], size + 4))
         draw.rectangle(draw.textbbox(place, str(number), font, anchor="lb"), fill=(40, 40, 40))

@@ -13,8 +13,8 @@ from mpfjax.checks import CountOrZero, checked, is_series, saying, shown, warn
 from mpfjax.vision.files.boxes import read_detections
 from mpfjax.vision.tracking.detections import Detections, to_masked_rows
 
-# MOTChallenge's columns: frame, id, x, y, w, h, and the score, where there is one.
-_BOX, _SCORE = slice(2, 6), 6
+# Columns: frame, id, x, y, w, h, the score, where there is one, and the class if there are eight.
+_BOX, _SCORE, _CLASS = slice(2, 6), 6, 7
 # A tracker that is made for rows of detections has room for at most so many objects.
 LEAST_ROOM, MOST_ROOM = 24, 1024
 _END = object()
@@ -22,6 +22,8 @@ _END = object()
 
 class Rows:
     """Rows (frame, id, x, y, w, h, score) as MOTChallenge files have them; the id is not read.
+
+    Where there are eight columns, the last is the class, as `read_detections` has it.
 
     Frames count from 1; in a frame without rows nothing is there. Without pixels `last` is the last
     frame, by default that of the last row.
@@ -47,11 +49,14 @@ class Rows:
         self.is_limited = last is not None
         self.last = int(self.frames.max(initial=0)) if last is None else last
 
-    def of_frame(self, number: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """The boxes and scores of a frame."""
+    def of_frame(self, number: int) -> Detections:
+        """Those of a frame."""
         begin, end = np.searchsorted(self.frames, [number, number + 1])
         rows = self._rows[begin:end]
-        return rows[:, _BOX], rows[:, _SCORE] if rows.shape[1] > _SCORE else None
+        of_kind = rows[:, _CLASS] if rows.shape[1] == _CLASS + 1 else None
+        return Detections(
+            rows[:, _BOX], rows[:, _SCORE] if rows.shape[1] > _SCORE else None, of_kind
+        )
 
     def num_after(self, last: int) -> int:
         """How many rows lie in later frames."""

@@ -47,7 +47,7 @@ class Spans(NamedTuple):
 class Lives(NamedTuple):
     """The identity of each object, and its counts of frames.
 
-    - `identities`: (m,); `classes`: (m,), 0 for none.
+    - `identities`: (m,); `classes`: (m,), 0 for none; `scores`: (m,), of the latest detection.
     - `seen`: (m,), in how many frames it had a strong detection.
     - `unseen`, `unsure`: (m,), for how many frames it has had no detection, and no strong one.
     - `confirmed`: (m,), whether it has had enough; `shown`: (m,), whether it should be shown.
@@ -55,6 +55,7 @@ class Lives(NamedTuple):
 
     identities: Int[np.ndarray, " m"]
     classes: Int[np.ndarray, " m"]
+    scores: Float[np.ndarray, " m"]
     seen: Int[np.ndarray, " m"]
     unseen: Float[np.ndarray, " m"]
     unsure: Float[np.ndarray, " m"]
@@ -67,7 +68,7 @@ class Lives(NamedTuple):
     ) -> "Lives":
         """Those of new objects, which are confirmed at once in the first frame."""
         one, sure = np.ones_like(identities), np.full(len(identities), at_once)
-        return cls(identities, classes, one, 0.0 * one, 0.0 * one, sure, sure)
+        return cls(identities, classes, 0.0 * one, one, 0.0 * one, 0.0 * one, sure, sure)
 
     def at(self, rows: np.ndarray) -> "Lives":
         """Those of some objects."""
@@ -77,9 +78,17 @@ class Lives(NamedTuple):
         """Those of both, one after the other."""
         return Lives(*map(np.concatenate, zip(self, other, strict=True)))
 
-    def classified(self, told: Int[np.ndarray, " m"]) -> "Lives":
-        """With the classes of the detections for those who have none as yet."""
-        return self._replace(classes=np.where(self.classes > 0, self.classes, told))
+    def described(
+        self,
+        detected: Bool[np.ndarray, " m"],
+        classes: Int[np.ndarray, " m"],
+        scores: Float[np.ndarray, " m"],
+    ) -> "Lives":
+        """With the scores of the detections, and the classes for those who have none as yet."""
+        return self._replace(
+            classes=np.where(self.classes > 0, self.classes, classes),
+            scores=np.where(detected, scores, self.scores),
+        )
 
     def counted(
         self,
@@ -104,7 +113,9 @@ class Lives(NamedTuple):
         unsure = np.where(strong, 0.0, self.unsure + frames)
         confirmed = self.confirmed | (seen >= _CONFIRMED)
         recent = confirmed & (unseen <= coast) & (unsure <= spans.unsure)
-        lives = Lives(self.identities, self.classes, seen, unseen, unsure, confirmed, recent)
+        lives = self._replace(
+            seen=seen, unseen=unseen, unsure=unsure, confirmed=confirmed, shown=recent
+        )
         in_the_way = full & (seen < _CONFIRMED)
         tentative = 0 if full else _TENTATIVE * frames
         most = np.where(confirmed, np.where(in_the_way, spans.coast, spans.patience), tentative)

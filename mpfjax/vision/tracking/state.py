@@ -61,6 +61,7 @@ class Tracks(NamedTuple):
       detector gave; -1 for none. Use it to look up masks and features.
     - `probabilities`: (m,), that this detection is the object's own; 0 where there is none.
     - `classes`: (m,), the class of each, the first that its detections had; 0 for none.
+    - `scores`: (m,), the score of the latest detection of each, 1 where detections have none.
     - `left_out`: how many detections of this frame could not be tracked.
     """
 
@@ -73,6 +74,7 @@ class Tracks(NamedTuple):
     detections: Int[Array | np.ndarray, " m"]
     probabilities: Float[Array | np.ndarray, " m"]
     classes: Int[Array | np.ndarray, " m"]
+    scores: Float[Array | np.ndarray, " m"]
     left_out: Int[np.ndarray, ""] | int = 0
 
     @property

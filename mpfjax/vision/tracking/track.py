@@ -166,13 +166,23 @@ def _tracked(
 # --- tracks as files have them -------------------------------------------------------------
 
 
-def online_rows(number: int, tracks: Tracks) -> Float[np.ndarray, "k 6"]:
-    """Rows (frame, id, x, y, w, h) of the objects that are shown in each frame (`Tracks.shown`)."""
-    return _rows(number, tracks, tracks.shown)
+def online_rows(
+    number: int, tracks: Tracks, *, described: bool = False
+) -> Float[np.ndarray, "k columns"]:
+    """Rows (frame, id, x, y, w, h) of the objects that are shown in each frame (`Tracks.shown`).
+
+    With `described` each has two more columns, the score of its latest detection and its class.
+    """
+    return _rows(number, tracks, tracks.shown, described)
 
 
-def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r 6"]:
-    """Rows of every object that was shown at some time, including its unconfirmed frames."""
+def offline_rows(
+    kept: Iterable[Tracks], first: int = 1, *, described: bool = False
+) -> Float[np.ndarray, "r columns"]:
+    """Rows of every object that was shown at some time, including its unconfirmed frames.
+
+    The columns are those of `online_rows`.
+    """
     kept = list(kept)
     believed = {0}
     for tracks in kept:
@@ -183,16 +193,20 @@ def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r
             number,
             tracks,
             np.isin(tracks.identities, chosen) & (tracks.shown | ~np.asarray(tracks.confirmed)),
+            described,
         )
         for number, tracks in enumerate(kept, first)
     ]
-    return np.concatenate([np.zeros((0, 6)), *rows])
+    return np.concatenate([np.zeros((0, 8 if described else 6)), *rows])
 
 
-def _rows(number: int, tracks: Tracks, written: Any) -> np.ndarray:
+def _rows(number: int, tracks: Tracks, written: Any, described: bool) -> np.ndarray:
     written = np.flatnonzero(np.asarray(written) & (np.asarray(tracks.identities) > 0))
     corners = tracks.corner_boxes[written]
     ids = np.asarray(tracks.identities)[written]
-    rows = np.column_stack([np.full(len(ids), number), ids, corners])
+    more = (tracks.scores, tracks.classes) if described else ()
+    rows = np.column_stack(
+        [np.full(len(ids), number), ids, corners, *(np.asarray(each)[written] for each in more)]
+    )
     # Rounded as in files, so that scores are the same from a file.
     return np.round(rows[np.argsort(ids, kind="stable")], 3)

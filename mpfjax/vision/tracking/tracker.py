@@ -194,6 +194,7 @@ def advanced(
     if found is None:
         return _unseen(state, chains)
     found.warn_of_first(state.left_out)
+    given = found.scores
     if tracker.scores == "ignore":
         found = found._replace(scores=np.ones_like(found.scores))
     if not tracker.class_matters:
@@ -242,7 +243,8 @@ def advanced(
     names = state.last_identity + 1 + np.arange(len(born))
     begun = Lives.begun(names, found.classes[born], at_once=not state.begun)
     taken = _Taken.of(np.append(source[stays], born), strong)
-    lives = counted.at(stays).joined(begun).classified(taken.values(found.classes, 0))
+    told = taken.values(found.classes, 0), taken.values(given, 0.0)
+    lives = counted.at(stays).joined(begun).described(taken.there, *told)
 
     boxes = boxes_of(objects.place)
     overlaps = overlap(boxes, boxes)
@@ -279,7 +281,7 @@ def _tracks(
     lives = state.lives
     told = lives.identities, lives.confirmed, lives.unseen, state.full, lives.shown
     boxes = boxes_of(state.objects.place)
-    return Tracks(boxes, *told, rows, probability, lives.classes, left_out)
+    return Tracks(boxes, *told, rows, probability, lives.classes, lives.scores, left_out)
 
 
 def _may_be_one(
