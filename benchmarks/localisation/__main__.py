@@ -2,10 +2,12 @@
 
     python -m benchmarks.localisation                       # all scenes that are there
     python -m benchmarks.localisation --scenes office ring --particles 1000
+    python -m benchmarks.localisation --scenes twelve --steps 40 --particles 5000
 
 Scenes are the buildings and the map of the folder that MPFJAX_DATA names, or ../shared/data, where
-they are there (each file of logs/, and turtlebot), a drawn office of nine rooms that are equal
-until a pillar is seen at the end, and a ring of 24 doors. Each has four drives. A robot knows
+they are there (each file of logs/, and turtlebot), drawn offices of nine and of ten rooms that are
+equal until a pillar is seen at the end, one of twelve equal rooms without any, and a ring of 24
+doors. Each has four drives. A robot knows
 nothing of its pose at first; when a drive has ended it is carried away without notice, and goes on
 with the next one.
 
@@ -13,7 +15,9 @@ A run is right where more than half of the distribution lies near the true pose:
 building 1 m, and .4 rad. `right` is the share of runs that are right at the end of the first drive,
 `found again` those at the end of the second, `steps` the median of the steps until a run is right
 after it was carried away, of those that ever are, and `sd of log Ẑ` that of the first drive,
-between runs of the same drive. All filters have --particles, but AMCL, which has 2000 to 5000.
+between runs of the same drive. Of twelve equal rooms each has a mass of 1/12 at all times: there
+are the errors of these masses at the end of the first drive and 15 scans after the robot was
+carried away, and the share of rooms that are lost, with a mass below .001. All filters have --particles, but AMCL, which has 2000 to 5000.
 
 Into --out DIR go localisation.json and recovery.png.
 """
@@ -30,12 +34,14 @@ from benchmarks import figures as plotting
 from benchmarks import harness
 from benchmarks.harness import AtLeast2, Seed, command
 from benchmarks.localisation.filters import NAMES, run
-from benchmarks.localisation.scenes import SCENES, Stretch
+from benchmarks.localisation.scenes import ROOMS, SCENES, Stretch
 
 TABLES = {
     "right at the end": "{right:.2f} ± {right_error:.2f}",
     "sd of log Ẑ": "{log_z_sd:.1f} ± {log_z_sd_error:.1f}",
     "found again, after steps": "{found:.2f} ± {found_error:.2f}, {steps:.0f}",
+    "RMSE of equal masses, lost": "{masses_rmse:.3f}, {masses_lost:.2f}",
+    "the same 15 scans after": "{masses_after_rmse:.3f}, {masses_after_lost:.2f}",
 }
 
 
@@ -66,7 +72,7 @@ def main(
         model, drives = SCENES[name](seed, steps)
         for filter in filters:
             found = [
-                follow(model, filter, pair, particles, components, seeds, 4 * seed + number)
+                follow(name, model, filter, pair, particles, components, seeds, 4 * seed + number)
                 for number, pair in enumerate(zip(drives, drives[1:] + drives[:1], strict=True))
             ]
             rows.append({"scene": name, "filter": filter, **summary(found, len(drives[0].poses))})
@@ -85,10 +91,11 @@ class Found(NamedTuple):
 
     right: np.ndarray  # (runs, t)
     log_z: np.ndarray
+    masses: np.ndarray | None  # (runs, t, rooms), of rooms that are equal at all times
 
 
 def follow(
-    model: Any, filter: str, drives: tuple[Stretch, Stretch], size: int, components: int,
+    scene: str, model: Any, filter: str, drives: tuple[Stretch, Stretch], size: int, components: int,
     seeds: int, seed: int,
 ) -> Found:  # fmt: skip
     """Runs of a filter on a drive, after which the robot is carried to the start of another."""
@@ -101,7 +108,9 @@ def follow(
     near = (jnp.hypot(x, y) < model.near) & (turned < 0.4)
     right = jnp.sum(jnp.where(near, jnp.exp(logs), 0.0), axis=-1) > 0.5
     log_z = jnp.sum(increments[:, : len(drives[0].poses)], axis=1)
-    return Found(np.asarray(right), np.asarray(log_z, float))
+    rooms = ROOMS.get(scene)
+    masses = rooms.masses(particles, jnp.exp(logs)) if rooms and not rooms.pillar else None
+    return Found(np.asarray(right), np.asarray(log_z, float), masses)
 
 
 def summary(found: list[Found], carried: int) -> dict[str, Any]:
@@ -112,12 +121,20 @@ def summary(found: list[Found], carried: int) -> dict[str, Any]:
     errors = np.sqrt(by_step * (1 - by_step) / runs)
     after = right[:, carried:] > 0
     ever = after.any(axis=1)
+    equal = [each.masses for each in found if each.masses is not None]
+    at_times = {"masses": carried - 1, "masses_after": carried + 14} if equal else {}
+    errors_of_masses = {}
+    for name, t in at_times.items():
+        masses = np.concatenate(equal)[:, min(t, right.shape[1] - 1)]
+        rmse = float(np.sqrt(np.mean((masses - 1 / masses.shape[1]) ** 2)))
+        errors_of_masses |= {f"{name}_rmse": rmse, f"{name}_lost": float(np.mean(masses < 1e-3))}
     return {
         "runs": runs, "carried": carried, "by_step": by_step, "errors": errors,
         "right": by_step[carried - 1], "right_error": errors[carried - 1],
         "found": by_step[-1], "found_error": errors[-1],
         "steps": float(np.median(1 + after[ever].argmax(axis=1))) if ever.any() else None,
         "log_z_sd": deviation, "log_z_sd_error": deviation / np.sqrt(2 * (runs - len(found))),
+        **errors_of_masses,
     }  # fmt: skip
 
 
