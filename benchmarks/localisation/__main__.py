@@ -15,9 +15,10 @@ A run is right where more than half of the distribution lies near the true pose:
 building 1 m, and .4 rad. `right` is the share of runs that are right at the end of the first drive,
 `found again` those at the end of the second, `steps` the median of the steps until a run is right
 after it was carried away, of those that ever are, and `sd of log Ẑ` that of the first drive,
-between runs of the same drive. Of twelve equal rooms each has a mass of 1/12 at all times: there
-are the errors of these masses at the end of the first drive and 15 scans after the robot was
-carried away, and the share of rooms that are lost, with a mass below .001. All filters have --particles, but AMCL, which has 2000 to 5000.
+between runs of the same drive. Each of twelve equal rooms has a mass of 1/12 at all times: there
+are the errors of these masses at the end of the first drive, and 15 scans after the robot was
+carried away, and the share of rooms that are lost, with a mass below .001. All filters have
+--particles, but AMCL, which has 2000 to 5000.
 
 Into --out DIR go localisation.json and recovery.png.
 """
@@ -44,6 +45,7 @@ TABLES = {
     "the same 15 scans after": "{masses_after_rmse:.3f}, {masses_after_lost:.2f}",
 }
 
+LATER = 15  # scans after the robot was carried away, when masses are looked at
 
 QUICK = ["replacing 1%", "AMCL", "mixture, with_restarts"]
 
@@ -91,12 +93,13 @@ class Found(NamedTuple):
 
     right: np.ndarray  # (runs, t)
     log_z: np.ndarray
-    masses: np.ndarray | None  # (runs, t, rooms), of rooms that are equal at all times
+    masses: np.ndarray | None
+    """(runs, 2, rooms), of rooms without a pillar: at the end of the first drive, and later."""
 
 
 def follow(
-    scene: str, model: Any, filter: str, drives: tuple[Stretch, Stretch], size: int, components: int,
-    seeds: int, seed: int,
+    scene: str, model: Any, filter: str, drives: tuple[Stretch, Stretch], size: int,
+    components: int, seeds: int, seed: int,
 ) -> Found:  # fmt: skip
     """Runs of a filter on a drive, after which the robot is carried to the start of another."""
     both = map(np.concatenate, zip(*drives, strict=True))
@@ -108,8 +111,11 @@ def follow(
     near = (jnp.hypot(x, y) < model.near) & (turned < 0.4)
     right = jnp.sum(jnp.where(near, jnp.exp(logs), 0.0), axis=-1) > 0.5
     log_z = jnp.sum(increments[:, : len(drives[0].poses)], axis=1)
-    rooms = ROOMS.get(scene)
-    masses = rooms.masses(particles, jnp.exp(logs)) if rooms and not rooms.pillar else None
+    rooms, masses = ROOMS.get(scene), None
+    if rooms and not rooms.pillar:
+        carried = len(drives[0].poses)
+        at = np.minimum([carried - 1, carried - 1 + LATER], len(poses) - 1)
+        masses = rooms.masses(particles[:, at], np.exp(logs[:, at]))
     return Found(np.asarray(right), np.asarray(log_z, float), masses)
 
 
@@ -121,21 +127,24 @@ def summary(found: list[Found], carried: int) -> dict[str, Any]:
     errors = np.sqrt(by_step * (1 - by_step) / runs)
     after = right[:, carried:] > 0
     ever = after.any(axis=1)
-    equal = [each.masses for each in found if each.masses is not None]
-    at_times = {"masses": carried - 1, "masses_after": carried + 14} if equal else {}
-    errors_of_masses = {}
-    for name, t in at_times.items():
-        masses = np.concatenate(equal)[:, min(t, right.shape[1] - 1)]
-        rmse = float(np.sqrt(np.mean((masses - 1 / masses.shape[1]) ** 2)))
-        errors_of_masses |= {f"{name}_rmse": rmse, f"{name}_lost": float(np.mean(masses < 1e-3))}
     return {
         "runs": runs, "carried": carried, "by_step": by_step, "errors": errors,
         "right": by_step[carried - 1], "right_error": errors[carried - 1],
         "found": by_step[-1], "found_error": errors[-1],
         "steps": float(np.median(1 + after[ever].argmax(axis=1))) if ever.any() else None,
         "log_z_sd": deviation, "log_z_sd_error": deviation / np.sqrt(2 * (runs - len(found))),
-        **errors_of_masses,
+        **errors_of_masses([each.masses for each in found if each.masses is not None]),
     }  # fmt: skip
+
+
+def errors_of_masses(masses: list[np.ndarray]) -> dict[str, float]:
+    """Of all runs, at both times; nothing of rooms that are not equal."""
+    errors = {}
+    for t, name in enumerate(("masses", "masses_after") if masses else ()):
+        at = np.concatenate(masses)[:, t]
+        errors[f"{name}_rmse"] = float(np.sqrt(np.mean((at - 1 / at.shape[1]) ** 2)))
+        errors[f"{name}_lost"] = float(np.mean(at < 1e-3))
+    return errors
 
 
 def picture(rows: list[dict[str, Any]]) -> Any:

@@ -45,8 +45,9 @@ PILOT = 1 / 5
 LEAST_PART, MOST_POWERS = 0.8, 64
 # Moves after each power of y_t, over t: the first ones are cheap.
 MOVES = (12, 8, 6, 3, 2, 1)
-# Shares of the moves: of noise, and of walks, the others being differences of two of the pilot.
-OF_NOISE, OF_WALKS = 0.15, 0.3
+# Shares of the moves: of noise, of walks, and of differences of any two of the pilot, the others
+# being differences of neighbours.
+OF_NOISE, OF_WALKS, OF_JUMPS = 0.15, 0.25, 0.45
 # What a move leaves of the noise of a step, and the least part of a deviation of x_0 in a walk.
 KEPT_NOISE, LEAST_SIZE = 0.7, 2.0**-8
 
@@ -279,8 +280,8 @@ def _proposed(
     """Other x_0 with the same noise, or the same with other noise of step s.
 
     Steps of x_0 are walks of many sizes, in each coordinate another, and differences of two of the
-    pilot, which are in order along a curve, any distance apart: those of neighbours fit a mode, and
-    others lead from mode to mode.
+    pilot, which are in order along a curve: those of neighbours fit a mode, and those of any two
+    lead from mode to mode.
     """
     (p, d), flat = pilot.shape, flatten_states(paths.places)
     to_places = jax.vmap(ravel_pytree(jax.tree.map(lambda leaf: leaf[0], paths.places))[1])
@@ -290,7 +291,8 @@ def _proposed(
     walk = deviations * LEAST_SIZE ** uniform_of(sizes, pilot.dtype).T
     walk *= normal_of(directions, pilot.dtype).T
     one = (first * p).astype(jnp.int32)
-    distance = jnp.exp(jnp.log(p / 2) * apart).astype(jnp.int32)
+    is_jump = kind > 1 - OF_JUMPS
+    distance = jnp.where(is_jump, p * apart, jnp.exp(jnp.log(p / 2) * apart)).astype(jnp.int32)
     other = (one + jnp.where(words[3] % 2 == 0, distance, p - distance)) % p
     step = select_rows(kind < OF_NOISE + OF_WALKS, walk, take(pilot, one) - take(pilot, other))
     moves_noise = kind < OF_NOISE
