@@ -194,6 +194,14 @@ def test_scores_of_chains_that_become_sure_are_strong_and_of_those_that_end_are_
     assert float(scored(far, lasting=50).strong) < 0.35
 
 
+def test_what_an_empty_street_leaves_does_not_become_sure():
+    """An object of score 6 is there for three seconds; then false detections alone, of up to 2."""
+    rng = np.random.default_rng(0)
+    there = [[((5, 5), tuple(rng.uniform(100, 900, 2))), [6.0, 1.0]] for _ in range(75)]
+    empty = [[rng.uniform(100, 900, (2, 2)), rng.uniform(0, 2, 2)] for _ in range(250)]
+    assert float(scored([*there, *empty]).strong) > 2
+
+
 @pytest.mark.parametrize("score", [-2.0, 0.3, 7.0])
 def test_equal_scores_are_all_strong(score):
     state = scored([[((5, 5), (50, 50)), [score, score]]] * 200)

@@ -10,7 +10,8 @@ from scipy.special import expit, logit
 from mpfjax.vision.tracking.associate import argmax_pairs
 from mpfjax.vision.tracking.gaussian import overlap
 
-_REMEMBERED = 512
+# Minutes: in a street that is empty for a while, what is left must not set what is sure.
+_REMEMBERED = 8192
 _HIGH = 0.9  # the quantile of the scores that is called a sure score
 _BINS = 10  # of shares of a sure detection's score
 _CENTRES = (np.arange(_BINS) + 0.5) / _BINS
@@ -26,7 +27,7 @@ _GONE = 2  # longest gap in a chain, in frames with detections
 class ScoreState(NamedTuple):
     """The scores so far, chains of detections that overlap from frame to frame, and their fates.
 
-    - `recent`: the latest scores, at most 512.
+    - `recent`: the latest scores, at most 8192.
     - `weak`, `strong`: the least score that counts, and from which on a detection is strong.
     - `boxes`: (c, 4), the last box of each living chain, moved with the camera; `unseen`: frames
       with detections since its last one.
@@ -66,7 +67,7 @@ class ScoreState(NamedTuple):
         """Remember the frame's scores, continue the chains, and set the thresholds.
 
         Weak detections sustain a track; only strong ones start one (Zhang et al. 2022, ByteTrack).
-        Scores are measured as shares of a sure score, the 0.9 quantile of the last 512, counted
+        Scores are measured as shares of a sure score, the 0.9 quantile of the last 8192, counted
         from zero or, where some scores are negative, from the lowest. If all are equal, all are
         strong. A chain is an object if it ever reaches nine tenths of a sure score, or lasts for
         `lasting` frames: something far away may never be scored highly. It is none if it ends
@@ -80,7 +81,8 @@ class ScoreState(NamedTuple):
         Detections come strongest first, so many `frames` after those before.
         """
         recent = np.concatenate([self.recent, scores])[-_REMEMBERED:]
-        sure = np.sort(recent)[int(np.ceil(_HIGH * (len(recent) - 1)))] if len(recent) else 0.0
+        rank = int(np.ceil(_HIGH * (len(recent) - 1)))
+        sure = np.partition(recent, rank)[rank] if len(recent) else 0.0
         lowest = recent.min(initial=0.0)
         spread = sure - lowest
         shares = (scores - lowest) / spread if spread > 0 else np.ones_like(scores)
