@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
@@ -27,6 +28,7 @@ from mpfjax.moves.base import (
 )
 from mpfjax.moves.initial import sample_initial
 from mpfjax.operations.compiling import jit_with_floats_traced
+from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import drawn_once
 from mpfjax.report import StepInfo, report_of
@@ -179,6 +181,11 @@ class Filter(eqx.Module):
     def _now(self, observation: PyTree, is_initial: bool = False) -> Step:
         return Step(self.model, observation, self.propagation, is_initial)
 
+    @property
+    def _periods(self) -> PyTree:
+        as_float = lambda period: jnp.asarray(period, default_float())  # noqa: E731
+        return jax.tree.map(as_float, getattr(self.model, "periods", None))
+
     def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
         return sample_initial(key, self.model, self.num_particles, self.initial_noise)
 
@@ -198,13 +205,14 @@ class Filter(eqx.Module):
         if self.weighs_initially:
             mixture, log_mass = mixture.normalised(mixture)
             mixture = mixture.replace(log_scale=log_mass, waits=log_mass != 0)
-        return mixture
+        return mixture.replace(periods=self._periods)
 
     def _step(
         self, key: Key[Array, "*keys"], mixture: ParticleMixture, observation: PyTree = None
     ) -> tuple[ParticleMixture, StepInfo]:
         """A step; without an observation it only predicts."""
         now, mixture = self._now(observation), mixture.with_own_ancestors()
+        mixture = mixture.replace(periods=None)
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
         for move_key, move in zip(split(key, len(self.moves)), self.moves, strict=True):
@@ -221,6 +229,7 @@ class Filter(eqx.Module):
         evidence = None
         if SURPRISE in mixture.memory:
             mixture, evidence = hearing(self.moves, mixture, now, increment)
+        mixture = mixture.replace(periods=self._periods)
         return mixture, report_of(mixture, increment, resampled, evidence)
 
     def _step_and_faults(

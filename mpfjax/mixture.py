@@ -85,6 +85,8 @@ class ParticleMixture(eqx.Module):
     - `waits`: whether x_0 was chosen by the first observation and weighs the inverse, so that no
       resampling is due before that observation has weighed x_1 too: it would undo the choice. None
       where no initial move weighs.
+    - `periods`: of a model that has them, in the form of one state, so that means and covariances
+      are those on a circle. Within a step it is None.
 
     The properties are those of one mixture. For a stack of mixtures, as `monte_carlo` and
     `collect=None` return, they raise a `ValueError` that says to `jax.vmap` over the leading axes.
@@ -101,6 +103,7 @@ class ParticleMixture(eqx.Module):
     parents: PyTree = None
     in_order: bool = eqx.field(static=True, default=False)
     waits: Bool[Array, ""] | None = None
+    periods: PyTree = None
 
     @property
     def num_particles(self) -> int:
@@ -213,19 +216,22 @@ class ParticleMixture(eqx.Module):
         return self.component_sums(along_rows(weights, values) * filled)
 
     def component_means(self, periods: PyTree = None) -> PyTree:
-        """The weighted mean of each component: every leaf (m, ...), zero for a dead one.
+        """The weighted mean of each component: every leaf (m, ...), NaN for a dead one.
 
         Leaves that are not floating point are averaged as `component_averages` does.
 
         - `periods`: of the numbers that go round, as angles do, in the form of one state: for a
           pose `np.array([0, 0, 2 * np.pi])`, zero for what does not. Their mean is the direction of
-          the mean vector on the circle (Mardia and Jupp 2000), and at most half a period.
+          the mean vector on the circle (Mardia and Jupp 2000), and at most half a period. None
+          takes those of the model.
         """
-        means = _averages(self.component_averages, self.particles, periods)
-        if not isinstance(means, MarginalisedState):
-            return means
-        within = self._component_spread(self.particles.mean)
-        return means._replace(covariance=means.covariance + within)
+        means = _averages(self.component_averages, self.particles, self._periods(periods))
+        if isinstance(means, MarginalisedState):
+            within = self._component_spread(self.particles.mean)
+            means = means._replace(covariance=means.covariance + within)
+        # Zero would look like a place.
+        alive = lambda leaf: jnp.where(along_rows(self.active, leaf), leaf, jnp.nan)  # noqa: E731
+        return jax.tree.map(alive, means)
 
     def component_covariances(self, periods: PyTree = None) -> Float[Array, "m d d"]:
         """The weighted covariance of each component's flattened state, zero for a dead one.
@@ -233,7 +239,7 @@ class ParticleMixture(eqx.Module):
         With `periods`, see `component_means`, what goes round differs from its mean by the shorter
         way.
         """
-        if periods is not None:
+        if (periods := self._periods(periods)) is not None:
             widened = lambda leaf, period: jnp.broadcast_to(period, leaf[:1].shape)  # noqa: E731
             every = jax.tree.map(widened, points(self.particles), points(periods))
             periods = flatten_states(every)[0]
@@ -260,7 +266,7 @@ class ParticleMixture(eqx.Module):
 
         `periods` is that of `component_means`.
         """
-        means = _averages(self.average, self.particles, periods)
+        means = _averages(self.average, self.particles, self._periods(periods))
         if not isinstance(means, MarginalisedState):
             return means
         centred = self.particles.mean - means.mean[None]
@@ -409,6 +415,9 @@ class ParticleMixture(eqx.Module):
         """A copy with some fields changed."""
         return dataclasses.replace(self, **fields)
 
+    def _periods(self, given: PyTree) -> PyTree:
+        return self.periods if given is None else given
+
     def _require_one(self) -> None:
         shape = self.log_weights.shape
         if len(shape) != 1:
@@ -468,6 +477,9 @@ def _averages(average: Callable[[Array], Array], values: PyTree, periods: PyTree
     """The averages of the values, leaf by leaf, on a circle where there is a period."""
     if periods is None:
         return jax.tree.map(average, values)
+    if isinstance(values, MarginalisedState):
+        latent, mean = _averages(average, points(values), points(periods))
+        return MarginalisedState(latent, mean, average(values.covariance))
 
     def on_circle(values: Array, period: ArrayLike) -> Array:
         mean, period = average(values), jnp.asarray(period)

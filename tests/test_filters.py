@@ -285,3 +285,54 @@ def test_features_and_scale_are_given_once(make):
     )
     features = of_one.initial_moves[-1].features
     np.testing.assert_array_equal(features(jnp.eye(2)), [1.0, 0.0])
+
+
+class Heading(mpfjax.AbstractStateSpaceModel):
+    """An angle near ±π."""
+
+    periods = 2 * np.pi
+
+    def sample_initial(self, key, num_particles):
+        return self.sample_transition(key, jnp.full(num_particles, jnp.pi))
+
+    def sample_transition(self, key, states):
+        moved = states + 0.1 * jax.random.normal(key, states.shape)
+        return (moved + jnp.pi) % (2 * jnp.pi) - jnp.pi
+
+    def log_likelihood(self, observation, states):
+        return -0.5 * ((observation - jnp.sin(states)) / 0.1) ** 2
+
+
+def test_mixtures_know_the_periods_of_their_model(tmp_path):
+    series = mpfjax.Series.skipping(np.array([0.0, np.nan, 0.05, 0.0]))
+    plain = mpfjax.mixture_particle_filter(Heading(), 60, 3)
+
+    def mean(mixture):
+        return mixture.mean()
+
+    filters = plain, mpfjax.particle_filter(Heading(), 60), mpfjax.with_restarts(plain)
+    runs = [mpfjax.run_filter(KEY, each, series, mean) for each in filters]
+    runs.append(mpfjax.run_islands(KEY, plain, series, mean, num_islands=2))
+    for run in runs:
+        assert all(abs(each.mean()) > 2.8 for each in (run.initial, run.final))
+    keys = jax.random.split(KEY, 2)
+    runs.append(mpfjax.monte_carlo(keys, plain, series, mean, slots=64))
+    assert all(np.all(np.abs(run.collected) > 2.8) for run in runs)
+    whole = mpfjax.run_filter(KEY, plain, series).collected
+    np.testing.assert_allclose(jax.vmap(mean)(whole), runs[0].collected, rtol=1e-5)
+    moved, _ = plain.step(KEY, plain.init(KEY), 0.0)
+    mpfjax.save_checkpoint(tmp_path / "at", moved)
+    assert abs(mpfjax.load_checkpoint(tmp_path / "at", moved).mean()) > 2.8
+
+
+def test_a_dead_component_has_no_mean_and_hides_nothing():
+    mixture = mpfjax.mixture_particle_filter(Heading(), 60, 3).init(KEY)
+    mixture = mixture.replace(component_indicators=jnp.ones(60, jnp.int32))
+    means = mixture.component_means()
+    np.testing.assert_array_equal(np.isnan(means), [True, False, True])
+
+    def alive(particles):
+        means = mixture.replace(particles=particles).component_means()
+        return jnp.sum(means[1]) + jnp.nansum(means)
+
+    assert np.all(np.isfinite(jax.grad(alive)(mixture.particles)))

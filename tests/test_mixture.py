@@ -41,7 +41,7 @@ def test_what_is_derived_is_what_numpy_gives(mixture):
         np.testing.assert_allclose(within[slots], w, rtol=1e-4, atol=1e-6)
         size = 1 / (w**2).sum() if slots.size else 0.0
         assert mixture.component_effective_sample_sizes[m] == pytest.approx(size, rel=1e-4)
-        mean = w @ states[slots] if slots.size else np.zeros(2)
+        mean = w @ states[slots] if slots.size else np.full(2, np.nan)
         centred = states[slots] - mean
         np.testing.assert_allclose(means[m], mean, rtol=1e-4, atol=1e-5)
         covariance = (w[:, None] * centred).T @ centred
@@ -87,6 +87,12 @@ def test_what_goes_round_is_averaged_on_its_circle():
     found = as_leaves.mean({"x": periods[:2], "heading": periods[2]})
     turned = np.angle(weights @ np.exp(1j * np.asarray(states[:, 2])))
     assert found["heading"] == pytest.approx(turned, 1e-4)
+    # A mixture that knows them is not told again.
+    for given in (np.array([0.0, 4.0, 2 * np.pi]), None):
+        knows = mixture.replace(periods=periods if given is None else given)
+        np.testing.assert_allclose(knows.component_means(), means, rtol=1e-6)
+        np.testing.assert_allclose(knows.component_covariances(), covariances, rtol=1e-5)
+        np.testing.assert_allclose(knows.mean(), mixture.mean(periods), rtol=1e-6)
     # As features, near ones are as far apart as the numbers are.
     near = OnCircles((0.0, 4.0))(jnp.array([[0.0, 1.999], [0.3, -1.999]]))
     np.testing.assert_allclose(jnp.hypot(*(near[1] - near[0])[1:]), 0.002, rtol=0.01)
@@ -121,6 +127,7 @@ def test_states_that_are_not_floats_are_averaged_as_numbers():
         np.testing.assert_allclose(mean[name], expected, rtol=1e-5, atol=1e-6)
         for m, slots in enumerate(members(mixture)):
             expected = np.einsum("i,i...->...", within[slots], values[slots])
+            expected = expected if slots.size else np.full_like(expected, np.nan)
             np.testing.assert_allclose(by_component[name][m], expected, rtol=1e-5, atol=1e-6)
     found = mixture.average(mixture.particles["mode"] == 2)
     assert float(found) == pytest.approx(weights[states["mode"] == 2].sum(), rel=1e-5)

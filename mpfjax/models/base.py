@@ -37,7 +37,8 @@ class AbstractStateSpaceModel(eqx.Module):
     first, `exact.grid_filter` and particle Gibbs with a prior the second, a bootstrap filter none.
 
     A class may set `periods`, in the form of one state: those of numbers that go round, as angles
-    do, and zero for all others. Recipes of mixtures then group particles on the circle.
+    do, and zero for all others. Recipes of mixtures then group particles on the circle, and means
+    of mixtures are those on it.
 
     In place of `sample_transition`, a model may define how x_t is made of noise:
     `transition_from_noise(noise, states)`, whose `noise` is standard normal, (n, k), and

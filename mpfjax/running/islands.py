@@ -132,6 +132,7 @@ def _whole_mixture(islands: ParticleMixture) -> ParticleMixture:
         ancestor_indices=side_by_side(islands.ancestor_indices),
         num_components=num_islands * num_components,
         memory=islands.memory,
+        periods=jax.tree.map(lambda leaf: leaf[0], islands.periods),
     )
 
 

@@ -40,7 +40,8 @@ def moved_by(move, key, mixture):
 
 @jax.jit
 def summaries(mixture):
-    moments = mixture.component_means(), mixture.component_covariances(), mixture.mean()
+    means = jnp.where(mixture.active[:, None], mixture.component_means(), 0.0)
+    moments = means, mixture.component_covariances(), mixture.mean()
     return *moments, mixture.component_effective_sample_sizes
 
 
