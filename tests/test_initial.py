@@ -11,6 +11,7 @@ import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.initial import SelectInitial, trusted
 from mpfjax.smoothing import conditional_filter, with_first_ancestors
+from tests.moves.start.test_window import PLACES, WithKeys
 from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import ScalarLinear
 
@@ -136,3 +137,14 @@ def test_impossible_and_empty_particles():
     assert np.all(np.isfinite(found))
     assert found[0] > 1 > found[1] >= 0.25
     np.testing.assert_array_equal(trusted(jnp.full((2, 3), -jnp.inf), jnp.ones(3)), 1.0)
+
+
+def test_a_prior_too_wide_for_its_draws_is_told(recwarn):
+    """Of 800 draws on a plane hardly one is near y_1; on a line some ten are."""
+    wide = mpfjax.mixture_particle_filter(WithKeys(), 200, 2)
+    with pytest.warns(RuntimeWarning, match=r"hardly any draw of x_0.*with_start.*log_initial"):
+        mpfjax.monte_carlo(jax.random.split(KEY, 4), wide, PLACES[:1], nothing)
+    recwarn.clear()
+    mpfjax.run_filter(KEY, mpfjax.with_start(wide, 1), PLACES[:1], nothing)
+    mpfjax.run_filter(KEY, mpfjax.mixture_particle_filter(WIDE, 200, 2), OBSERVATIONS, nothing)
+    assert not recwarn.list

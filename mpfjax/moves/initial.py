@@ -5,6 +5,7 @@ from typing import Any, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count
@@ -33,6 +34,8 @@ from mpfjax.operations.stored import stored, take, whole
 MOST_TRUST = 3 / 4
 # Draws of x_0 for each particle that are looked at together.
 MOST_AT_ONCE = 8
+# A prior is wide where fewer draws fit y_1, and a smaller part of all.
+FEWEST, LEAST_PART = 16, 1 / 64
 
 
 def sample_initial(
@@ -91,6 +94,19 @@ class SelectInitial(AbstractMove):
         start = self._selected(key, now, mixture.num_particles)
         own = {name: getattr(mixture, name) for name in ("ancestor_indices", "memory")}
         return start.replace(num_components=mixture.num_components, **own)
+
+    def num_fitting(self, log_weights: Float[np.ndarray, " n"]) -> float:
+        """The effective number of draws that y_1 speaks for, told from the weights of the chosen.
+
+        It is (Σ ν)² / Σ ν² over the K N draws, of which N are chosen in proportion to ν.
+        """
+        weights = np.exp(log_weights[log_weights > -np.inf].astype(float))
+        return float(self.num_draws * len(weights) / np.mean(1 / (len(weights) * weights)))
+
+    def is_wide(self, log_weights: Float[np.ndarray, " n"]) -> bool:
+        """Whether so few draws fit y_1 that chance decides the masses of modes."""
+        number, drawn = self.num_fitting(log_weights), self.num_draws * len(log_weights)
+        return bool(number < min(FEWEST, LEAST_PART * drawn))
 
     def _selected(self, key: Key[Array, ""], now: Step, n: int) -> ParticleMixture:
         """N of K N draws; a few draws a particle at a time, so that memory has room for them."""

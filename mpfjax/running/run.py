@@ -14,7 +14,7 @@ from mpfjax.models.observations import as_series
 from mpfjax.moves.eve_indices import EVE_INDICES, with_new_eve_indices
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import choose_devices, num_processors, over_devices, over_threads
-from mpfjax.running.scan import FilterRun, first_mixture, initial_keys, scan, sound
+from mpfjax.running.scan import FilterRun, first_mixture, initial_keys, scan, sound, told_of_start
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
 # have a row of particles each, which counts as so many times the particles.
@@ -55,7 +55,7 @@ def run_filter(
     """
     series = as_series(observations, filter.model, inputs, missing)
     run = lambda filter: _run(key, filter, series, collect)  # noqa: E731
-    return sound(with_floats_traced(run, filter))
+    return told_of_start(sound(with_floats_traced(run, filter)), filter)
 
 
 @checked
@@ -105,7 +105,7 @@ def monte_carlo(
         chosen = None if leave_to_caller else choose_devices(devices)
         return over_devices(_run_each, _run_on_threads, starts, arguments, chosen)
 
-    return sound(with_floats_traced(run, filter))
+    return told_of_start(sound(with_floats_traced(run, filter)), filter)
 
 
 _run = jit_on_wide_vectors(scan)

@@ -16,6 +16,7 @@ from mpfjax.checks import saying, warn
 from mpfjax.filter import BROKEN_DENSITY, Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import Series
+from mpfjax.moves.initial import SelectInitial
 from mpfjax.operations.islands import num_islands
 from mpfjax.operations.random import split, split_for_run
 from mpfjax.report import StepInfo
@@ -121,6 +122,7 @@ _KEPT = (
 )
 # The effective number of fewer particles tells nothing.
 _NEARLY_ALL, _FEWEST_TOLD = 0.9, 8
+_MOST_LOOKED_AT = 16  # runs, for what is told of their start
 Report = dict[str, PyTree]
 """What a run keeps of a step's report, or of those of all steps."""
 
@@ -204,3 +206,18 @@ def sound(run: FilterRun, free: bool = True) -> FilterRun:
 def _in_how_many(which: np.ndarray | np.bool_) -> str:
     """In how many of several runs, and nothing for one run."""
     return f" in {which.sum()} of {which.size} runs" if which.ndim else ""
+
+
+def told_of_start(run: FilterRun, filter: Filter) -> FilterRun:
+    """The run, after a RuntimeWarning where few draws of x_0 fit y_1, in most of the first runs."""
+    weights = run.initial.log_weights
+    chosen = [move for move in filter.initial_moves if isinstance(move, SelectInitial)]
+    if not chosen or isinstance(weights, Tracer):
+        return run
+    looked_at = np.asarray(weights).reshape(-1, weights.shape[-1])[:_MOST_LOOKED_AT]
+    if np.mean([chosen[0].is_wide(each) for each in looked_at]) > 0.5:
+        said = f"hardly any draw of x_0 fits the first observation, of {chosen[0].num_draws} for"
+        said += " each particle, so that chance decides which modes live and their masses."
+        said += " mpfjax.with_start begins with a sampler on the first observations; it needs the"
+        warn(f"{said} density of x_0, log_initial, in the model")
+    return run
