@@ -48,6 +48,7 @@ class Results:
         self.clock, self.ahead = Clock("track", "write"), Clock("read", "detect")
         self.rows: list[np.ndarray] = []
         self.kept: list[Tracks] = []  # for --offline alone
+        self.times: list[float] = []  # of the frames of a video
         self.num_frames = 0
         self.without_room = 0  # frames with more objects than there is room for
         self.left_out = 0  # detections that could not be tracked
@@ -173,6 +174,7 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
             tracker,
             key=key,
             first=source.first,
+            times=results.times if source.has_pixels and options.fps is None else None,
             min_score=options.min_score,
             use_colours=not options.no_colour,
             frame_size=source.frame_size,
@@ -199,7 +201,8 @@ def _track(results: Results, start: Start) -> None:
         if source.has_pixels and not options.no_video:
             draw = opened.enter_context(_video(options.out / VIDEO, source.frames_per_second))
         if source.has_pixels:
-            read = frames.read_frames(source.path, source.first, source.last)
+            path, times = source.path, results.times
+            read = frames.read_frames(path, source.first, source.last, times=times)
             stills = watched(opened.enter_context(read_ahead(read)))
             # Detecting may be slow, and is best divided among processors.
             if not (options.detect or options.box or options.no_colour) and has_opencv():

@@ -76,6 +76,9 @@ def test_a_video_of_variable_frame_rate_has_the_frames_that_it_holds(tmp_path):
     assert np.abs(back - stills).max() <= 8
     np.testing.assert_array_equal(back[4:7], np.stack(list(read_frames(path, 5, 7))))
     assert frame_rate(path) == pytest.approx(15, rel=0.1)
+    times: list[float] = []
+    assert [times[-1] for _ in read_frames(path, 2, 4, times=times)] == times
+    np.testing.assert_allclose(times, [0.1, 0.1 + 1 / 30, 0.2 + 1 / 30], atol=1e-3)
 
 
 # a, b, c, d of a file that moves (x, y) to (a x + c y, b x + d y), and what becomes of a frame.

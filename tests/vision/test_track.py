@@ -318,3 +318,17 @@ def test_drawn_boxes_give_one_track_each_in_the_order_given():
         assert rows[:, 1].tolist() == [1, 2]
         expected = walks()[walks()[:, 0] == number][::-1, 2:6]
         np.testing.assert_allclose(rows[:, 2:4], expected[:, :2], atol=9)
+
+
+def test_frames_move_objects_by_the_time_between_them():
+    """One that walks steadily, seen at 10 and 2.5 frames a second by turns, never out of sight."""
+    times = np.cumsum([0.1, 0.4] * 12)
+    boxes = [np.array([[60 * time, 20.0, 30.0, 60.0]]) for time in times]
+    tracker = ObjectTracker(3, frames_per_second=10)
+    *_, steady = track(None, boxes, tracker, times=times)
+    assert steady.identities.tolist() == [1]
+    unseen = [*boxes[:-1], None]  # where no detector ran, it is predicted
+    *_, ahead = track(None, unseen, tracker, times=times)
+    assert ahead.corner_boxes[0, 0] == pytest.approx(60 * times[-1], abs=3)
+    with pytest.raises(ValueError, match="time: "):
+        list(track(None, boxes, tracker, times=times[::-1]))

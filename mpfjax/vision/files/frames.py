@@ -18,6 +18,7 @@ from mpfjax.vision.files.sequences import read_sequence_info
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 # The folder of images in a sequence; MOTChallenge's is the second.
 _INNER = ("img", "img1")
+_RATE = 25.0  # frames a second of a video that does not say it
 _SOME = 20  # as many numbers are said
 # In half to .7 of the time of the preset "fast" at rate 20, with the same quality to .1 dB, in
 # files a tenth larger.
@@ -25,14 +26,25 @@ _X264 = {"crf": "19", "preset": "veryfast", "x264-params": "rc-lookahead=30:subm
 
 
 @checked
-def read_frames(path: str | Path, first: Count = 1, last: Count | None = None) -> Iterator[Any]:
+def read_frames(
+    path: str | Path,
+    first: Count = 1,
+    last: Count | None = None,
+    *,
+    times: list[float] | None = None,
+) -> Iterator[Any]:
     """Read frames `first` to `last`, both included and counted from 1: arrays (h, w, 3), in RGB.
 
     `path` is a video file, a folder of images in the natural order of their names (2.png before
     10.png), or a folder with such a folder `img` or `img1`. All frames of a video are read,
     whatever the time between them; both are rotated as the file says. None stands for a frame that
     is too damaged to be decoded, so that those after it keep their numbers; a `RuntimeWarning` at
-    the end has the number and the count of these. Raises `ImportError` without PyAV for a video,
+    the end has the number and the count of these.
+
+    `times`: a list that takes the time of each frame of a video in seconds, before the frame comes;
+    always rising, by the mean rate where the file says nothing else. It stays empty for images.
+
+    Raises `ImportError` without PyAV for a video,
     `FileNotFoundError` where there is nothing, and `ValueError` with `path` if it cannot be read,
     has no frames, or has frames of different sizes, and for `first` and `last` that are no range.
     """
@@ -41,8 +53,9 @@ def read_frames(path: str | Path, first: Count = 1, last: Count | None = None) -
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"path: {path} does not exist")
-    frames = _read_images(path, first, last) if path.is_dir() else _read_video(path, first, last)
-    return of_one_kind(frames, first, str(path))
+    if path.is_dir():
+        return of_one_kind(_read_images(path, first, last), first, str(path))
+    return of_one_kind(_read_video(path, first, last, times), first, str(path))
 
 
 def parse_range(text: str | None, argument: str = "frames") -> tuple[int, int | None]:
@@ -203,9 +216,17 @@ def _read_images(folder: Path, first: int, last: int | None) -> Iterator[np.ndar
         yield frame
 
 
-def _read_video(path: Path, first: int, last: int | None) -> Iterator[np.ndarray | None]:
-    number, damaged = 0, []
+def _read_video(
+    path: Path, first: int, last: int | None, times: list[float] | None
+) -> Iterator[np.ndarray | None]:
+    number, damaged, latest = 0, [], -math.inf
+    step = 0.0 if times is None else 1 / (frame_rate(path) or _RATE)
     for number, frame in enumerate(_decoded(path), 1):
+        if number >= first and times is not None:
+            said = None if frame is None else frame.time
+            rises = said is not None and said > latest
+            latest = float(said) if rises else max(latest, -step) + step
+            times.append(latest)
         if number >= first and frame is None:
             damaged.append(number)
             yield None

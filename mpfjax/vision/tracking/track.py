@@ -35,6 +35,7 @@ def track(
     *,
     key: Key[Array, ""] | None = None,
     first: Count | None = None,
+    times: Iterable[float] | None = None,
     min_score: Finite | None = None,
     max_detections: Count | None = None,
     use_colours: bool = True,
@@ -64,6 +65,8 @@ def track(
     - `key`: counts for nothing, since nothing is drawn.
     - `first`: the number of the first frame, by which rows are found. None is 1, and without
       `frames` that of the first row.
+    - `times`: of the frames in seconds, rising, where these are not equally far apart; a video that
+      is given by its path has its own. None takes `frames_per_second` of the tracker.
     - `min_score`: detections with a lower score are left out; None leaves out none.
     - `max_detections`: the most detections in a frame; if there are more, the strongest are kept.
       None takes twice the tracker's `max_objects`.
@@ -95,14 +98,16 @@ def track(
         tracker = ObjectTracker(detector.most_objects() if of_rows else LEAST_ROOM)
     first = (first_step(detector, first, tracker.rate) if frames is None else first) or 1
     if isinstance(frames, str | Path):
-        frames = read_frames(frames, first)
+        told: list[float] = []
+        frames, times = read_frames(frames, first, times=told), told if times is None else times
     room = 2 * tracker.max_objects if max_detections is None else max_detections
     stills = None if frames is None else of_one_kind(frames, first)
     if camera_motion is None and stills is not None and use_colours and has_opencv():
         camera_motion = "pixels"
     flow = OpticalFlow() if camera_motion == "pixels" else None
     found = observed(stills, detector, first)
-    seen = _seen(found, frame_size, min_score, room, use_colours, flow)
+    times = iter(() if times is None else times)
+    seen = _seen(found, times, frame_size, min_score, room, use_colours, flow)
     return _tracked(seen, tracker, ahead)
 
 
@@ -112,10 +117,12 @@ class _Seen(NamedTuple):
     number: int
     found: Found | None
     motion: CameraMotion | None
+    time: float | None
 
 
 def _seen(
     frames: Iterator[tuple[int, np.ndarray | None, Detections | None]],
+    times: Iterator[float],
     frame_size: tuple[int, int] | None,
     min_score: float | None,
     room: int,
@@ -144,7 +151,7 @@ def _seen(
                 found = coloured(found, still)
         if flow is not None and still is not None:
             motion = flow(still, None if found is None else top_left(found.boxes))
-        yield _Seen(number, found, motion)
+        yield _Seen(number, found, motion, next(times, None))
 
 
 def _tracked(
@@ -152,8 +159,8 @@ def _tracked(
 ) -> Generator[Tracks, None, None]:
     state, once = tracker.init(), Once()
     with read_ahead(seen) if ahead else contextlib.nullcontext(seen) as coming:
-        for number, found, motion in coming:
-            state, tracks = advanced(tracker, state, found, motion)
+        for number, found, motion, time in coming:
+            state, tracks = advanced(tracker, state, found, motion, time)
             if tracks.full:
                 once.warn(
                     "objects",
