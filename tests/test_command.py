@@ -145,8 +145,8 @@ def test_some_frames_of_a_video_without_colours_or_truth(sequence, tmp_path):
 
 
 def test_frames_that_cannot_be_decoded_are_in_all_that_is_written(given, tmp_path, monkeypatch):
-    def damaged(path, first, last):
-        for number, frame in enumerate(read_frames(path, first, last), first):
+    def damaged(path, first, last, **told):
+        for number, frame in enumerate(read_frames(path, first, last, **told), first):
             yield None if number in (3, 4) else frame
 
     monkeypatch.setattr(frame_files, "read_frames", damaged)
@@ -167,8 +167,8 @@ def test_an_interrupt_leaves_what_was_done(given, tmp_path, monkeypatch, capsys)
     """Before the first frame, also the files of an older run."""
     read = frame_files.read_frames
 
-    def interrupted(path, first, last):
-        for number, frame in enumerate(read(path, first, last), first):
+    def interrupted(path, first, last, **told):
+        for number, frame in enumerate(read(path, first, last, **told), first):
             if number == 5:
                 raise KeyboardInterrupt
             yield frame

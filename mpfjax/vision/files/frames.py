@@ -223,9 +223,8 @@ def _read_video(
     step = 0.0 if times is None else 1 / (frame_rate(path) or _RATE)
     for number, frame in enumerate(_decoded(path), 1):
         if number >= first and times is not None:
-            said = None if frame is None else frame.time
-            rises = said is not None and said > latest
-            latest = float(said) if rises else max(latest, -step) + step
+            said = -math.inf if frame is None or frame.time is None else float(frame.time)
+            latest = said if said > latest else max(latest, -step) + step
             times.append(latest)
         if number >= first and frame is None:
             damaged.append(number)
