@@ -303,14 +303,14 @@ BUGS = {
     ),
     "PaRIS leaves sums where they were": Bug(
         "smoothing/sums.py",
-        "return jax.tree.map(of_pasts, terms), values",
-        "return terms, values",
+        "return of_pasts(terms), _over_draws(Terms(values, no_spread), num_draws)",
+        "return terms, _over_draws(Terms(values, no_spread), num_draws)",
         "tests/smoothing/test_contracts.py -m 'not exactness' -k PaRIS",
     ),
     "a fixed lag keeps the term that is overwritten": Bug(
         "smoothing/sums.py",
-        "own[(t + 1) % num_kept], averages)",
-        "own[t % num_kept], averages)",
+        "last = (t + 1) % num_kept",
+        "last = t % num_kept",
         "tests/smoothing/test_contracts.py -k 'lag and MCMC and mpf and one'",
     ),
     "the variance of log Ẑ counts pairs for less": Bug(
