@@ -23,7 +23,6 @@ class AbstractLookahead(Given):
 
     def check(self, now: Step) -> None:
         """Raise a `ValueError` for a model that it is not for; most are for any."""
-        del now
 
     @abc.abstractmethod
     def log_factors(self, mixture: ParticleMixture, now: Step) -> Float[Array, " n"]:

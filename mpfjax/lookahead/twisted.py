@@ -55,7 +55,6 @@ class Twist(AbstractLookahead):
 
     def log_factors(self, mixture: ParticleMixture, now: Step | None = None) -> Float[Array, " n"]:
         """log ν of the next step, whatever y_t is."""
-        del now
         return self.next(mixture).log_normaliser(self.features_of(mixture.particles))
 
 
@@ -96,7 +95,6 @@ class PropagateTwisted(AbstractPropagation, AbstractWrapper):
 
     def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """The number of steps so far."""
-        del model, num_components
         return {STEP: {"step": jnp.zeros((), jnp.int32)}}
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:

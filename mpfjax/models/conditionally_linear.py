@@ -101,7 +101,6 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """log of the density of what is seen of z alone; zero here."""
-        del observation
         return jnp.zeros(jax.tree.leaves(states)[0].shape[0], default_float())
 
     def linear_observation(self, observation: PyTree) -> Float[Array, " p"]:

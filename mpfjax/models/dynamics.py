@@ -88,12 +88,10 @@ class AbstractDynamics(Fitting):
 
     def remembered(self, following: Rows, current: Rows, previous: Rows | None) -> Rows | None:
         """The past of x_t, in `following`: x_{t-1} where the order is 2, and None where it is 1."""
-        del following, previous
         return current if self.order == 2 else None
 
     def initial_past(self, key: Key[Array, ""], current: Rows) -> Rows | None:
         """The past of x_0: x_0 itself where the order is 2, which then stands still."""
-        del key
         return current if self.order == 2 else None
 
 
@@ -116,7 +114,6 @@ class RandomWalk(AbstractDynamics):
 
     def expected(self, current: Rows, previous: Rows | None = None) -> Rows:
         """x_{t-1}."""
-        del previous
         return current
 
     def step(self, noise: Float[Array, "n k"]) -> Rows:

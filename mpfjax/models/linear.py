@@ -244,7 +244,6 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
         self, latent: Int[Array, " n"], previous_latent: Int[Array, " n"]
     ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
         """F, b and Q of the regime z_t."""
-        del previous_latent
         b = jnp.zeros(self.m0.shape[-1], self.m0.dtype) if self.b is None else self.b
         return self._of(latent, self.F, 2), self._of(latent, b, 1), self._of(latent, self.Q, 2)
 

@@ -74,7 +74,6 @@ class AbstractMetropolis(AbstractMarkovMove):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model without `log_transition`."""
-        del num_particles, num_components
         refuse_marginalised(now.model, type(self).__name__)
         require(now.model, "log_transition", type(self).__name__)
 

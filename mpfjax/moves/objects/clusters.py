@@ -108,7 +108,6 @@ class PropagateInClusters(AbstractPropagationByObject):
 
     def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """The clusters' labels, and the steps since the last contact of each two objects."""
-        del num_components
         num_objects = model.num_objects
         labels = jnp.arange(num_objects, dtype=jnp.int32)
         if self.start == "together":

@@ -55,7 +55,6 @@ class Exclusion(AbstractExclusion, ByFeatures):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Lower the weight of every particle by its nearness to the means of other components."""
-        del key
         if mixture.num_components == 1 or is_missing(now):
             return mixture
         features, own = self.features_of(mixture), mixture.component_indicators

@@ -29,7 +29,6 @@ class AbstractPropagationByObject(AbstractPropagation):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model of one object."""
-        del num_particles, num_components
         check(MultiObjectModel, model=now.model)
 
 

@@ -23,7 +23,6 @@ class AbstractProposal(Given):
 
     def check(self, now: Step) -> None:
         """Raise a `ValueError` for a model that the proposal is not for; most are for any."""
-        del now
 
     @abc.abstractmethod
     def propose(

@@ -56,7 +56,6 @@ class RegimeProposal(AbstractProposal):
 
     def noise_dimension(self, previous_states: MarginalisedState) -> int:
         """1."""
-        del previous_states
         return 1
 
     def propose_from_noise(
@@ -114,12 +113,10 @@ class PropagateRegimes(AbstractPropagation):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for another model."""
-        del num_particles, num_components
         require_regimes(now.model, "PropagateRegimes")
 
     def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
         """All living components."""
-        del now
         return mixture.active
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:

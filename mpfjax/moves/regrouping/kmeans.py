@@ -39,7 +39,6 @@ class KMeans(AbstractRegrouping, ByFeatures):
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """Each particle to the component whose centroid is nearest."""
-        del key
         features, occupied, m = self.features_of(mixture), mixture.occupied, mixture.num_components
         if self.reseed:
             alive = jnp.ones(m, bool)

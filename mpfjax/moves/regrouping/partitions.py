@@ -25,7 +25,6 @@ class Pool(AbstractRegrouping):
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """Component 0 for every particle."""
-        del key
         return jnp.zeros_like(mixture.component_indicators), mixture.memory
 
 
@@ -94,7 +93,6 @@ class GroupBy(AbstractRegrouping):
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The label of every particle; that of an empty slot is moved into [0, M)."""
-        del key
         with saying("function of GroupBy", "called with the particles"):
             labels: Any = self.function(mixture.particles)
         n, dtype = mixture.num_particles, getattr(labels, "dtype", float)

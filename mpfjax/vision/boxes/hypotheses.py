@@ -100,12 +100,10 @@ class AdaptAppearance(AbstractPropagation):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model that learns no colours."""
-        del num_particles, num_components
         check(LearnedColourModel, model=now.model)
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Learn from this frame, unless it is missing."""
-        del key
         if is_missing(now):
             return mixture
         model: Any = now.model
@@ -136,7 +134,6 @@ class ObjectExclusion(AbstractExclusion):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Lower the weight of every particle according to its distance from the other objects."""
-        del key
         if is_missing(now):
             return mixture
         states, owners = mixture.particles, component_references(mixture)
