@@ -129,32 +129,28 @@ def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Any:
 @eqx.filter_jit
 def _kalman_filter(constant, observations, inputs):
     """Means and covariances of x_1, ..., x_t, and the increments."""
-    laws, increments = filtered(_start(constant), _steps(constant), inputs, observations)
+    laws, increments = filtered(*_begun(constant), inputs, observations)
     return laws.moments, increments
 
 
 @eqx.filter_jit
 def _smooth(constant, observations, inputs):
-    start, step_of = _start(constant), _steps(constant)
+    start, step_of = _begun(constant)
     laws, increments = filtered(start, step_of, inputs, observations)
     moments, lagged = smoothed(start, laws, step_of, inputs)
     return KalmanSmootherRun(*moments, lagged, jnp.sum(increments))
 
 
-def _start(constant: LinearGaussianModel) -> "Law":
-    return Law.of(constant.m0, constant.P0)
+def _begun(constant: LinearGaussianModel) -> tuple["Law", StepOf]:
+    """The law of x_0, and the matrices of a step by its inputs."""
 
+    def step_of(now: PyTree) -> LinearStep:
+        model = with_inputs(constant, now)
+        nothing = jnp.zeros(model.H.shape[0], model.m0.dtype)
+        b = jnp.zeros_like(model.m0) if model.control is None else model.control
+        return LinearStep(model.A, b, model.Q, model.H, nothing, model.R)
 
-def _steps(constant: LinearGaussianModel) -> StepOf:
-    return lambda now: _step_of(constant, now)
-
-
-def _step_of(constant: LinearGaussianModel, now: PyTree) -> LinearStep:
-    """The model's matrices at the step whose inputs are these."""
-    model = with_inputs(constant, now)
-    nothing = jnp.zeros(model.H.shape[0], model.m0.dtype)
-    b = jnp.zeros_like(model.m0) if model.control is None else model.control
-    return LinearStep(model.A, b, model.Q, model.H, nothing, model.R)
+    return Law.of(constant.m0, constant.P0), step_of
 
 
 class Law(NamedTuple):

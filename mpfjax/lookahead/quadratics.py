@@ -170,7 +170,10 @@ def neutral(
 ) -> LocalQuadratics:
     """ψ = 1: no information about later observations."""
     k, d, j = num_experts, num_features, num_noises
-    zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
+
+    def zeros(*shape: int) -> Array:
+        return jnp.zeros(shape, dtype)
+
     identities = jnp.broadcast_to(jnp.eye(j, dtype=dtype), (k, j, j))
     return LocalQuadratics(
         zeros(k, d), zeros(k, d, d), zeros(k), zeros(k), zeros(k, d), zeros(k, d, d),

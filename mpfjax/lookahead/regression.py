@@ -99,9 +99,9 @@ def _draw_points(
     num_coefficients = _num_coefficients(dimension + num_noises)
     needed = _PARTICLES_A_COEFFICIENT * num_coefficients
     copies = -(-2 * needed * num_experts // mixture.num_particles)
-    repeated = lambda leaf: jnp.repeat(leaf, copies, axis=0)  # noqa: E731
-    states = jax.tree.map(repeated, mixture.particles)
-    features, log_weights = twist.features_of(states), repeated(mixture.log_weights)
+    repeated = mixture.repeated(copies)
+    states, log_weights = repeated.particles, repeated.log_weights
+    features = twist.features_of(states)
     shape = (len(log_weights), num_noises + 1)
     noise, log_ratio = used.draw(jax.random.normal(key, shape, features.dtype), features)
     unseen = completed(model, made_of(model, noise, states), states)
@@ -114,8 +114,7 @@ def _draw_points(
     is_number = jnp.isfinite(targets)
     targets = jnp.where(is_number, targets, jnp.min(jnp.where(is_number, targets, jnp.inf)))
     log_importance = jnp.where(is_number, targets + log_ratio + log_weights, -jnp.inf)
-    labels = repeated(mixture.component_indicators)
-    components = jax.nn.one_hot(labels, num_experts, dtype=features.dtype)
+    components = jax.nn.one_hot(repeated.component_indicators, num_experts, dtype=features.dtype)
     return _Points(
         features, noise, targets.astype(features.dtype), log_importance.astype(features.dtype),
         components, needed * copies,

@@ -147,11 +147,14 @@ def _initial_moments(model: Any, latent: PyTree) -> list[Array]:
 
 def predicted(model: Any, latent: PyTree, state: MarginalisedState) -> MarginalisedState:
     """The moments of x_t given z_t and y_1..y_{t-1}, from those of x_{t-1}."""
-    n, moved = state.mean.shape[0], predicted_gaussian(model, latent, state)
+    law = predicted_gaussian(model, latent, state)
     check_moved(latent, state.latent, model)
-    return MarginalisedState(
-        latent, particles_first(moved.mean, n), particles_first(moved.covariance, n)
-    )
+    return _state_of(latent, law, state.mean.shape[0])
+
+
+def _state_of(latent: PyTree, law: Gaussian, n: int) -> MarginalisedState:
+    """The law of each particle with the particles first."""
+    return MarginalisedState(latent, *(particles_first(values, n) for values in law))
 
 
 def predicted_gaussian(model: Any, latent: PyTree, state: MarginalisedState) -> Gaussian:
@@ -190,8 +193,7 @@ def updated(
         return state, None
     n, rows = state.mean.shape[0], observation_rows(model, observation, emission, state.mean.dtype)
     law, log_density = gaussians.update(filtered_gaussian(model, state), rows, emission)
-    mean, covariance = particles_first(law.mean, n), particles_first(law.covariance, n)
-    return MarginalisedState(state.latent, mean, covariance), jnp.broadcast_to(log_density, (n,))
+    return _state_of(state.latent, law, n), jnp.broadcast_to(log_density, (n,))
 
 
 def latent_from_noise(

@@ -25,6 +25,7 @@ from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 from mpfjax.operations.random import fast_key, normal, split_once
 
 Rows = Float[Array, "n d"]
+Deviations = Annotated[Float[Array, "*n d"], POSITIVE]
 
 
 class AbstractDynamics(Fitting):
@@ -103,9 +104,7 @@ class RandomWalk(AbstractDynamics):
     it where the last motion says little about the next.
     """
 
-    deviations: Annotated[Float[Array, "*n d"], POSITIVE] = eqx.field(
-        converter=to_array("deviations")
-    )
+    deviations: Deviations = eqx.field(converter=to_array("deviations"))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -140,9 +139,7 @@ class RandomWalkWithJumps(RandomWalk):
     and for a probability outside (0, 1). Use it where objects vanish and come back elsewhere.
     """
 
-    jump_deviations: Annotated[Float[Array, "*n d"], POSITIVE] = eqx.field(
-        converter=to_array("jump_deviations")
-    )
+    jump_deviations: Deviations = eqx.field(converter=to_array("jump_deviations"))
     jump_probability: InnerShare = eqx.field(static=True, default=0.03)
 
     @property

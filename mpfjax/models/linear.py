@@ -37,6 +37,8 @@ SquareOfEach = Float[Array, "d d"] | Float[Array, "k d d"]
 RowsOfEach = Float[Array, "p d"] | Float[Array, "k p d"]
 NoiseOfEach = Float[Array, "p p"] | Float[Array, "k p p"]
 OffsetOfEach = Float[Array, " p"] | Float[Array, "k p"]
+Regimes = Int[Array, " n"]
+Parts = Float[Array, "..."]
 
 
 class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
@@ -191,48 +193,40 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
             return self.initial_probabilities
         return jnp.full(self.num_regimes, 1 / self.num_regimes, self.transition_matrix.dtype)
 
-    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Int[Array, " n"]:
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Regimes:
         """z_0 by its probabilities."""
         shares = uniform(key, (num_particles,), self.transition_matrix.dtype)
         return self._initial(shares)
 
     noise_dimension = initial_noise_dimension = 1
 
-    def initial_from_noise(self, noise: Float[Array, "n 1"]) -> Int[Array, " n"]:
+    def initial_from_noise(self, noise: Float[Array, "n 1"]) -> Regimes:
         """z_0 of standard normal numbers."""
         return self._initial(jax.scipy.special.ndtr(noise[:, 0]))
 
-    def initial_moments(
-        self, latent: Int[Array, " n"]
-    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    def initial_moments(self, latent: Regimes) -> tuple[Parts, Parts]:
         """m0 and P0."""
         return self._of(latent, self.m0, 1), self._of(latent, self.P0, 2)
 
-    def sample_transition(self, key: Key[Array, ""], latent: Int[Array, " n"]) -> Int[Array, " n"]:
+    def sample_transition(self, key: Key[Array, ""], latent: Regimes) -> Regimes:
         """z_t by the row of z_{t-1}."""
         shares = uniform(key, latent.shape, self.transition_matrix.dtype)
         return self._next(shares, latent)
 
-    def transition_from_noise(
-        self, noise: Float[Array, "n 1"], latent: Int[Array, " n"]
-    ) -> Int[Array, " n"]:
+    def transition_from_noise(self, noise: Float[Array, "n 1"], latent: Regimes) -> Regimes:
         """z_t of standard normal numbers."""
         return self._next(jax.scipy.special.ndtr(noise[:, 0]), latent)
 
-    def log_transition(
-        self, latent: Int[Array, " n"], previous_latent: Int[Array, " n"]
-    ) -> Float[Array, " n"]:
+    def log_transition(self, latent: Regimes, previous_latent: Regimes) -> Float[Array, " n"]:
         """log Π of the two regimes."""
         k = self.num_regimes
         return spread(log_or_nothing(self.transition_matrix).ravel(), previous_latent * k + latent)
 
-    def log_initial(self, latent: Int[Array, " n"]) -> Float[Array, " n"]:
+    def log_initial(self, latent: Regimes) -> Float[Array, " n"]:
         """log P(z_0)."""
         return spread(log_or_nothing(self.probabilities_at_start), latent)
 
-    def all_transitions(
-        self, latent: Int[Array, " n"]
-    ) -> list[tuple[Int[Array, " n"], Float[Array, " n"]]]:
+    def all_transitions(self, latent: Regimes) -> list[tuple[Regimes, Float[Array, " n"]]]:
         """Every regime, with log of its probability after z_{t-1}."""
         log_matrix = log_or_nothing(self.transition_matrix)
         return [
@@ -240,29 +234,25 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
             for j in range(self.num_regimes)
         ]
 
-    def dynamics(
-        self, latent: Int[Array, " n"], previous_latent: Int[Array, " n"]
-    ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    def dynamics(self, latent: Regimes, previous_latent: Regimes) -> tuple[Parts, Parts, Parts]:
         """F, b and Q of the regime z_t."""
         b = jnp.zeros(self.m0.shape[-1], self.m0.dtype) if self.b is None else self.b
         return self._of(latent, self.F, 2), self._of(latent, b, 1), self._of(latent, self.Q, 2)
 
-    def emission(
-        self, latent: Int[Array, " n"]
-    ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    def emission(self, latent: Regimes) -> tuple[Parts, Parts, Parts]:
         """H, c and R of the regime z_t."""
         c = jnp.zeros(self.H.shape[-2], self.H.dtype) if self.c is None else self.c
         return self._of(latent, self.H, 2), self._of(latent, c, 1), self._of(latent, self.R, 2)
 
-    def _of(self, latent: Int[Array, " n"], values: Array, rank: int) -> Float[Array, "..."]:
+    def _of(self, latent: Regimes, values: Array, rank: int) -> Parts:
         """The parameter of each particle's regime; one that all regimes share, unchanged."""
         return values if values.ndim == rank else spread(values, latent)
 
-    def _initial(self, shares: Float[Array, " n"]) -> Int[Array, " n"]:
+    def _initial(self, shares: Float[Array, " n"]) -> Regimes:
         bounds = jnp.cumsum(self.probabilities_at_start)[:-1]
         return jnp.sum(shares[:, None] >= bounds[None], axis=1, dtype=jnp.int32)
 
-    def _next(self, shares: Float[Array, " n"], latent: Int[Array, " n"]) -> Int[Array, " n"]:
+    def _next(self, shares: Float[Array, " n"], latent: Regimes) -> Regimes:
         """The regime whose interval of the row's cumulative probabilities holds each number."""
         bounds = jnp.cumsum(self.transition_matrix, axis=1)
         drawn = jnp.zeros_like(latent)

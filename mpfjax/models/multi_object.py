@@ -121,8 +121,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
     def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """x_t of every object, independent of each other given x_{t-1}."""
-        keys = split(key, self.num_objects)
-        return self._of_each("sample_transition", (0, 1), keys, states)
+        return self._of_each("sample_transition", (0, 1), split(key, self.num_objects), states)
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """Σ_j log L(y_t | x_t^j) + Σ_{i<j} log ψ(x_t^i, x_t^j)."""
@@ -151,8 +150,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         """The observation of every object, leaves (n, J, ...)."""
         if self.shared_observation:
             raise ValueError("shared_observation: how several objects make one is not known")
-        keys = split(key, self.num_objects)
-        return self._of_each("sample_observation", (0, 1), keys, states)
+        return self._of_each("sample_observation", (0, 1), split(key, self.num_objects), states)
 
     def _of_each(self, method: str, axes: tuple[int, ...], *arguments: PyTree) -> PyTree:
         """What a method of each object's model gives, (n, J, ...), from its part of the arguments.
@@ -193,10 +191,8 @@ class MultiObjectModel(AbstractStateSpaceModel):
     def object_states(self, particles: PyTree, objects: Int[Array, "*n"]) -> PyTree:
         """The states of one object of each particle: every leaf (n, ...)."""
         if objects.ndim == 0:
-            return jax.tree.map(
-                lambda leaf: jax.lax.dynamic_index_in_dim(leaf, objects, 1, keepdims=False),
-                particles,
-            )
+            pick = partial(jax.lax.dynamic_index_in_dim, index=objects, axis=1, keepdims=False)
+            return jax.tree.map(pick, particles)
         rows = jnp.arange(objects.shape[0], dtype=jnp.int32)
         return jax.tree.map(
             lambda leaf: leaf.at[rows, objects].get(mode="promise_in_bounds"), particles
@@ -218,10 +214,10 @@ class MultiObjectModel(AbstractStateSpaceModel):
         if not self.per_object or objects.ndim == 0:
             return self.object_at(objects).sample_transition(key, states)
 
-        def draw(states: PyTree, j: Int[Array, ""], key: Key[Array, ""]) -> PyTree:
-            return self.object_at(j).sample_transition(key, states)
+        def draw(j: Int[Array, ""], states: PyTree, keys: Key[Array, "1"]) -> PyTree:
+            return self.object_at(j).sample_transition(keys[0], states)
 
-        return _one_by_one(draw, (states,), objects, split(key, objects.shape[0]))
+        return _one_by_one(draw, objects, states, split(key, objects.shape[0]))
 
     def prepare_observation(self, observation: PyTree) -> PyTree:
         """What the objects' likelihoods look at: y_t, or what the object model makes of it."""
@@ -236,16 +232,14 @@ class MultiObjectModel(AbstractStateSpaceModel):
     ) -> Float[Array, " n"]:
         """log L(y_t | x_t^j) of one object of each particle; y_t as prepared."""
 
-        def weigh(states: PyTree, j: Int[Array, "*n"]) -> Any:
+        def weigh(j: Int[Array, "*n"], states: PyTree) -> Any:
             of_object = observation
             if not self.shared_observation:
                 of_object = jax.tree.map(lambda leaf: leaf[j], observation)
             return self.object_at(j).log_likelihood(of_object, states)
 
-        if objects.ndim == 0 or (self.shared_observation and not self.per_object):
-            values = weigh(states, objects)
-        else:
-            values = _one_by_one(weigh, (states,), objects)
+        differ = objects.ndim > 0 and (self.per_object or not self.shared_observation)
+        values = _one_by_one(weigh, objects, states) if differ else weigh(objects, states)
         num_particles = jax.tree.leaves(states)[0].shape[0]
         return real_each(values, num_particles, self.object_model, "log_likelihood")
 
@@ -253,14 +247,24 @@ class MultiObjectModel(AbstractStateSpaceModel):
         self, states: PyTree, previous_states: PyTree, objects: Int[Array, "*n"]
     ) -> Float[Array, " n"]:
         """log D(x_t^j | x_{t-1}^j) of one object of each particle."""
+        return self._asked("log_transition", objects, states, previous_states)
 
-        def weigh(states: PyTree, previous: PyTree, j: Int[Array, "*n"]) -> Float[Array, " n"]:
-            model: Any = self.object_at(j)
-            return model.log_transition(states, previous)
+    def object_with_history(
+        self, states: PyTree, previous_states: PyTree, objects: Int[Array, "*n"]
+    ) -> PyTree:
+        """The states of one object of each particle, with the past of these previous ones."""
+        if not hasattr(self.object_model, "with_history"):
+            return states
+        return self._asked("with_history", objects, states, previous_states)
 
-        if not self.per_object or objects.ndim == 0:
-            return weigh(states, previous_states, objects)
-        return _one_by_one(weigh, (states, previous_states), objects)
+    def _asked(self, method: str, objects: Int[Array, "*n"], *states: PyTree) -> PyTree:
+        """What a method of the objects' models says of one object of each particle."""
+
+        def ask(j: Int[Array, "*n"], *states: PyTree) -> PyTree:
+            return getattr(self.object_at(j), method)(*states)
+
+        differ = objects.ndim > 0 and self.per_object
+        return _one_by_one(ask, objects, *states) if differ else ask(objects, *states)
 
     @property
     def _indices(self) -> Int[Array, " objects"]:
@@ -306,15 +310,15 @@ def _is_array(leaf: Any) -> bool:
 
 
 def _one_by_one(
-    function: Callable[..., PyTree], states: tuple[PyTree, ...], *others: Any
+    function: Callable[..., PyTree], objects: Int[Array, " n"], *states: PyTree
 ) -> PyTree:
-    """A function of the states of n particles, called for each with what is its own."""
+    """A function of an object and states of n particles, called for each particle alone."""
 
-    def of_one(states: tuple[PyTree, ...], *others: Any) -> PyTree:
-        values = function(*jax.tree.map(lambda leaf: leaf[None], states), *others)
+    def of_one(j: Int[Array, ""], *states: PyTree) -> PyTree:
+        values = function(j, *jax.tree.map(lambda leaf: leaf[None], states))
         return jax.tree.map(lambda leaf: leaf[0], values)
 
-    return jax.vmap(of_one)(states, *others)
+    return jax.vmap(of_one)(objects, *states)
 
 
 def _has_axis(model: Any, num_objects: int) -> bool:

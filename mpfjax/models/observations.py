@@ -86,7 +86,8 @@ def steps_of_inputs(
     own_length = _length(arrays, inputs, "inputs")
     if own_length != length:
         raise ValueError(f"inputs: their t is {own_length}, and that of the {of_what} is {length}")
-    return _refused_where(~_usable_steps(arrays, NOT_FINITE), arrays, f"inputs: {NOT_FINITE}")
+    usable = _steps_where(arrays, "all", _USABLE[NOT_FINITE])
+    return _refused_where(~usable, arrays, f"inputs: {NOT_FINITE}")
 
 
 def one_input(inputs: PyTree, model: Any, in_time: bool = False) -> PyTree:
@@ -152,7 +153,7 @@ def present_steps(observations: PyTree, series: Series, refused: str) -> Any:
 
     A warning says how many steps are skipped of which some numbers are there.
     """
-    usable, present = _usable_steps(observations, refused), series.present
+    usable, present = _steps_where(observations, "all", _USABLE[refused]), series.present
     numpy: Any = jnp if any(isinstance(mask, Tracer) for mask in (usable, present)) else np
     if present is not None:
         check_shape(f"{len(usable)}", present=present)
@@ -193,11 +194,6 @@ def refused_by(model: Any) -> str:
     if not getattr(model, "handles_missing", False):
         return NOT_FINITE
     return "infinite" if is_marginalised(model) else ""
-
-
-def _usable_steps(arrays: PyTree, refused: str) -> Any:
-    """At which steps all numbers may be handed to the model."""
-    return _steps_where(arrays, "all", _USABLE[refused])
 
 
 def _steps_where(arrays: PyTree, combine: str, holds: Callable[[Any, Any], Any]) -> Any:

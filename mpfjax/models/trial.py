@@ -4,12 +4,14 @@ series drawn from a model.
 
 import contextlib
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, checked, warn
@@ -72,16 +74,17 @@ def check_model(
 def _faults(key: Key[Array, ""], model: Any, observation: PyTree, inputs: PyTree) -> Iterator[str]:
     """What is wrong with the model's methods, one after the other, by their names."""
     keys = jax.random.split(key, 5)
-    yield from _of_draws("sample_initial", _many_initial(keys[0], model))
+    many = jax.vmap(partial(jax.random.split, num=_KEYS))(keys)
+    yield from _of_draws("sample_initial", _many_initial(many[0], model, _DRAWS))
     if callable(getattr(model, "log_initial", None)):
         values = model.log_initial(model.sample_initial(key, _DRAWS))
         if not np.isfinite(real_each(values, _DRAWS, model, "log_initial")).all():
             yield "log_initial is NaN or infinite at draws of sample_initial"
-    starts = _places(keys[1], model)
+    starts = _places(keys[1], model, _FAMILIES)
     model = with_inputs(model, inputs)
     copies = jax.tree.map(lambda leaf: jnp.repeat(leaf, _DRAWS, axis=0), starts)
     same = jax.tree.map(lambda leaf: leaf[: _PLACES * _DRAWS], copies)
-    yield from _of_draws("sample_transition", _many_moved(keys[2], model, same))
+    yield from _of_draws("sample_transition", _many_moved(many[2], model, same))
     states = _moved(keys[3], model, copies)
     yield from _of_likelihood(model, observation, states)
     if is_mixed(model) or callable(getattr(model, "log_transition", None)):
@@ -95,22 +98,10 @@ def _initial(key: Key[Array, ""], model: Any, number: int) -> PyTree:
     return with_moments(model, drawn)
 
 
-@eqx.filter_jit
-def _places(key, model):
-    return _initial(key, model, _FAMILIES)
-
-
-@eqx.filter_jit
-def _many_initial(key, model):
-    return jax.vmap(lambda key: _initial(key, model, _DRAWS))(jax.random.split(key, _KEYS))
-
-
-@eqx.filter_jit
-def _many_moved(key, model, states):
-    return jax.vmap(lambda key: moved(key, model, states))(jax.random.split(key, _KEYS))
-
-
-_moved, _likelihoods = eqx.filter_jit(moved), eqx.filter_jit(likelihoods)
+_for_each_key = partial(eqx.filter_vmap, in_axes=(0, None, None))
+_places, _many_initial = eqx.filter_jit(_initial), eqx.filter_jit(_for_each_key(_initial))
+_moved, _many_moved = eqx.filter_jit(moved), eqx.filter_jit(_for_each_key(moved))
+_likelihoods = eqx.filter_jit(likelihoods)
 
 
 def _of_draws(method: str, draws: PyTree) -> Iterator[str]:
@@ -145,12 +136,9 @@ def _columns(draws: PyTree) -> list[np.ndarray]:
 
 def _of_likelihood(model: Any, observation: PyTree, states: PyTree) -> Iterator[str]:
     """Faults of log L of draws of x_1."""
-    values, half = (
-        np.asarray(_likelihoods(model, observation, states), float),
-        _FAMILIES * _DRAWS // 2,
-    )
-    others = jax.tree.map(lambda leaf: leaf[half:], states)
-    others = np.asarray(_likelihoods(model, observation, others), float)
+    values, half = _likelihoods(model, observation, states), _FAMILIES * _DRAWS // 2
+    others = _likelihoods(model, observation, jax.tree.map(lambda leaf: leaf[half:], states))
+    values, others = np.asarray(values, float), np.asarray(others, float)
     if not (values < np.inf).all():
         yield "log_likelihood is NaN or +inf at a draw of x_1"
     if not np.allclose(values[half:], others, rtol=1e-3, atol=1e-3):
@@ -169,22 +157,20 @@ def _of_likelihood(model: Any, observation: PyTree, states: PyTree) -> Iterator[
 
 def _with_first_missing(observation: PyTree) -> PyTree:
     """y without its first floating point number; None if it has no other."""
-    leaves, structure = jax.tree.flatten(observation)
-    sizes = [jnp.size(leaf) * jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves]
-    if sum(sizes) < 2:
+    floats, others = eqx.partition(observation, eqx.is_inexact_array)
+    numbers, unravel = ravel_pytree(floats)
+    if len(numbers) < 2:
         return None
-    at = int(np.flatnonzero(sizes)[0])
-    first = jnp.ravel(leaves[at]).at[0].set(jnp.nan)
-    leaves[at] = first.reshape(jnp.shape(leaves[at]))
-    return jax.tree.unflatten(structure, leaves)
+    return eqx.combine(unravel(numbers.at[0].set(jnp.nan)), others)
 
 
 def _warn_of_derivative(model: Any, observation: PyTree, states: PyTree, where: str = "") -> None:
     """A warning if log L has a derivative of NaN by the numbers of the model."""
     # A model that cannot be differentiated at all says so to whoever does it.
     with contextlib.suppress(TypeError, ValueError, NotImplementedError):
-        run = lambda model: _derivative(model, observation, states)  # noqa: E731
-        slopes = jax.tree.leaves(with_floats_traced(run, model))
+        slopes = jax.tree.leaves(
+            with_floats_traced(lambda model: _derivative(model, observation, states), model)
+        )
         if any(np.isnan(slope).any() for slope in slopes):
             said = f"{model_name(model)}.log_likelihood has a derivative of NaN{where}"
             warn(f"model: {said}", UserWarning)
@@ -244,12 +230,7 @@ def _of_transition(
             )
 
 
-def _log_chance(
-    beside: Float[np.ndarray, "f s s"],
-    shares: Float[np.ndarray, "f s s"],
-    excess: float,
-    deviation: float,
-) -> float:
+def _log_chance(beside: np.ndarray, shares: np.ndarray, excess: float, deviation: float) -> float:
     """log of the most that a sum of values drawn by the shares is at least as large, by Chernoff.
 
     The bound holds for what seldom happens too, where a sum is far from normal.

@@ -16,9 +16,9 @@ from mpfjax.moves.objects.independent import (
     AbstractPropagationByObject,
     drawn_rows,
     moved_objects,
-    predicted,
     rows_of_each,
 )
+from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.regrouping.merge import lowest_connected
 from mpfjax.moves.resampling.allocation import require_equal_rows
 from mpfjax.operations.logarithms import default_float, finite_max
@@ -122,7 +122,7 @@ class PropagateInClusters(AbstractPropagationByObject):
         """
         model: Any = now.model
         if is_missing(now):
-            return predicted(key, mixture, model)
+            return predict(key, model, mixture, "none")
         require_equal_rows(mixture, "PropagateInClusters")
         num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
@@ -154,7 +154,7 @@ class PropagateInClusters(AbstractPropagationByObject):
 
         def impossible() -> ParticleMixture:
             nothing = jnp.full((1,), -jnp.inf, mixture.log_weights.dtype)
-            return predicted(key, mixture, model).weighed(nothing)
+            return predict(key, model, mixture, "none").weighed(nothing)
 
         return jax.lax.cond(log_growth == -jnp.inf, impossible, lambda: moved)
 

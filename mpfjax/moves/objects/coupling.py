@@ -141,7 +141,7 @@ def recombined(
         log_gain = jnp.where(counts, log_gain - jnp.where(counts, before, 0.0), 0.0)
         picked = jnp.where(alone[objects], parent_rows, picked)
         states = jax.tree.map(lambda leaf: leaf[picked, objects], points)
-        states = jax.vmap(partial(_with_history, model))(objects, states, parents)
+        states = model.object_with_history(states, parents, objects)
         chosen = model.replace_object(chosen, objects, states)
         log_weights += jnp.where(together[objects].T, log_gain[None], 0.0)
         moves = objects[:, None] == jnp.arange(num_objects, dtype=jnp.int32)[None]
@@ -160,17 +160,6 @@ def _log_kernels(
     """log f_j of the points of one object given one parent."""
     log_f = of_one(lambda parent, points: model.object_log_transition(points, parent, j))
     return log_f(parent, points).astype(default_float())
-
-
-def _with_history(
-    model: MultiObjectModel, j: Int[Array, ""], state: PyTree, parent: PyTree
-) -> PyTree:
-    """The state with the past of a given parent, not that of the parent it was drawn from."""
-    replace_past = getattr(model.object_at(j), "with_history", None)
-    if replace_past is None:
-        return state
-    many = lambda state: jax.tree.map(lambda leaf: leaf[None], state)  # noqa: E731
-    return jax.tree.map(lambda leaf: leaf[0], replace_past(many(state), many(parent)))
 
 
 def _log_potentials(

@@ -12,6 +12,7 @@ from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
 from mpfjax.models.base import model_name
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.moves.base import AbstractPropagation, Step, is_missing
+from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.allocation import require_equal_rows
 from mpfjax.moves.resampling.resample import Resample, Scheme
 from mpfjax.operations.logarithms import default_float
@@ -65,7 +66,7 @@ class PropagateIndependently(AbstractPropagationByObject):
         """One step of every object's filter; where y_t is missing, a prediction."""
         model: Any = now.model
         if is_missing(now):
-            return predicted(key, mixture, model)
+            return predict(key, model, mixture, "none")
         require_equal_rows(mixture, "PropagateIndependently")
         num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
@@ -81,11 +82,6 @@ class PropagateIndependently(AbstractPropagationByObject):
             particles=rows_of_each(points, rows), ancestor_indices=no_ancestors(mixture)
         )
         return moved.weighed(jnp.sum(log_growths)[None])
-
-
-def predicted(key: Key[Array, ""], mixture: ParticleMixture, model: Any) -> ParticleMixture:
-    """Draws of x_t ~ D(. | x_{t-1}) of all objects, and all else as it was."""
-    return mixture.replace(particles=model.sample_transition(key, mixture.particles))
 
 
 def moved_objects(

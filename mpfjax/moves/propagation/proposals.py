@@ -97,9 +97,8 @@ class NetworkProposal(_GaussianProposal):
         """An untrained one: a small network, whose draws are about N(x_{t-1}, scale²)."""
         sizes = (state_size + observation_size, 2 * state_size)
         network = eqx.nn.MLP(*sizes, width, depth, jax.nn.tanh, key=key)
-        last = lambda net: (net.layers[-1].weight, net.layers[-1].bias)  # noqa: E731
-        network = eqx.tree_at(last, network, [0.1 * leaf for leaf in last(network)])
-        return cls(network, scale)
+        last = jax.tree.map(lambda leaf: 0.1 * leaf, network.layers[-1])
+        return cls(eqx.tree_at(lambda net: net.layers[-1], network, last), scale)
 
     def propose_from_noise(
         self,
@@ -166,8 +165,7 @@ class GaussNewtonProposal(_GaussianProposal):
         previous_states: Float[Array, "n ..."],
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """The same, made of this noise."""
-        prior_means = _model(now).transition_mean(previous_states)
-        means, factors = self._fit(now, prior_means)
+        prior_means, means, factors = self._fit(now, previous_states)
         states = means + self.inflation * _solve_transposed(factors, noise)
         return states.reshape(prior_means.shape), self._log_density(noise, factors)
 
@@ -178,7 +176,7 @@ class GaussNewtonProposal(_GaussianProposal):
         previous_states: Float[Array, "n ..."],
     ) -> Float[Array, " n"]:
         """log q(x_t | x_{t-1}, y_t) of every particle."""
-        means, factors = self._fit(now, _model(now).transition_mean(previous_states))
+        _, means, factors = self._fit(now, previous_states)
         residuals = (states.reshape(means.shape) - means) / self.inflation
         return self._log_density(jnp.einsum("nij,ni->nj", factors, residuals), factors)
 
@@ -204,9 +202,8 @@ class GaussNewtonProposal(_GaussianProposal):
         `LinearGaussianModel`. It does not depend on the inflation. Use it as the look-ahead of
         `AuxiliaryResample`.
         """
-        prior_means = _model(now).transition_mean(previous_states)
-        means, factors = self._fit(now, prior_means)
-        model = _model(now)
+        model: Any = now.model
+        prior_means, means, factors = self._fit(now, previous_states)
         seen = model.observation_mean(means.reshape(prior_means.shape))
         covariance_y = _matrix(model.observation_covariance).astype(means.dtype)
         covariance = _matrix(model.transition_covariance).astype(means.dtype)
@@ -225,11 +222,12 @@ class GaussNewtonProposal(_GaussianProposal):
         return log_volume - 0.5 * squares - log_scale.astype(means.dtype)
 
     def _fit(
-        self, now: Step, prior_means: Float[Array, "n ..."]
-    ) -> tuple[Float[Array, "n d"], Float[Array, "n d d"]]:
-        """The means, and the Cholesky factors of the precisions Λ."""
-        model, state_shape = _model(now), prior_means.shape[1:]
-        prior = prior_means.reshape(prior_means.shape[0], -1)
+        self, now: Step, previous_states: Float[Array, "n ..."]
+    ) -> tuple[Float[Array, "n ..."], Float[Array, "n d"], Float[Array, "n d d"]]:
+        """The means of D, those of q, and the Cholesky factors of the precisions Λ."""
+        model: Any = now.model
+        prior_means = model.transition_mean(previous_states)
+        prior, state_shape = prior_means.reshape(len(prior_means), -1), prior_means.shape[1:]
         target = jnp.atleast_1d(now.observation).astype(prior.dtype)
         prior_precision = _inverse(_matrix(model.transition_covariance)).astype(prior.dtype)
         precision_y = _inverse(_matrix(model.observation_covariance)).astype(prior.dtype)
@@ -248,12 +246,7 @@ class GaussNewtonProposal(_GaussianProposal):
             information = prior @ prior_precision + jnp.einsum("ndq,nq->nd", gains, residuals)
             factors = cholesky(precisions)
             means = _solve_transposed(factors, solve_lower(factors, information))
-        return means, factors
-
-
-def _model(now: Step) -> Any:
-    """The model, whose means a type checker does not know of."""
-    return now.model
+        return prior_means, means, factors
 
 
 def _log_standard(
@@ -267,12 +260,9 @@ def _log_standard(
 def _solve_transposed(
     factors: Float[Array, "n d d"], vectors: Float[Array, "n d"]
 ) -> Float[Array, "n d"]:
-    """F⁻ᵀ v, by backward substitution."""
-    solved = jnp.zeros_like(vectors)
-    for i in reversed(range(vectors.shape[1])):
-        rest = vectors[:, i] - jnp.sum(factors[:, :, i] * solved, axis=1)
-        solved = solved.at[:, i].set(rest / factors[:, i, i])
-    return solved
+    """F⁻ᵀ v, by backward substitution: mirrored, the upper triangle is a lower one."""
+    mirrored = jnp.swapaxes(factors, 1, 2)[:, ::-1, ::-1]
+    return solve_lower(mirrored, vectors[:, ::-1])[:, ::-1]
 
 
 def _matrix(covariance: Float[Array, "..."]) -> Float[Array, "d d"]:

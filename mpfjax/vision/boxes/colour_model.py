@@ -16,6 +16,7 @@ from mpfjax.vision.colour.bins import AbstractColours, RGBColours
 from mpfjax.vision.colour.histograms import (
     LARGEST_NARROW,
     SURROUND,
+    Histograms,
     IntegralHistogram,
     bhattacharyya,
     integral_histogram,
@@ -25,6 +26,7 @@ from mpfjax.vision.colour.histograms import (
 from mpfjax.vision.files.boxes import centred, check_boxes
 from mpfjax.vision.files.frames import check_frame
 
+Seen = IntegralHistogram | UInt8[Array, "h w 3"]
 PAPER_VARIANCES = (2.5, 1.5, 0.05, 0.05)
 
 
@@ -247,25 +249,19 @@ class ColourModel(AbstractBoxModel):
             wide_counts=bool(room > LARGEST_NARROW),
         )
 
-    def log_likelihood(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
-    ) -> Float[Array, " n"]:
+    def log_likelihood(self, observation: Seen, states: BoxState) -> Float[Array, " n"]:
         """-(Σ_c B² - contrast Σ_c B²_around) / 2σ², each B² averaged over the bands."""
         counts, sides = self.counts(observation, states)
         distances = self.distances(counts, sides, *self.own(states))
         return -0.5 * distances / self.sigma**2
 
-    def prepare_observation(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], soon: bool = False
-    ) -> IntegralHistogram:
+    def prepare_observation(self, observation: Seen, soon: bool = False) -> IntegralHistogram:
         """The frame's integral histogram; a model of several objects builds it only once."""
         if isinstance(observation, IntegralHistogram):
             return observation
         return integral_histogram(observation, self.colours, self.wide_counts, soon)
 
-    def counts(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
-    ) -> tuple[Float[Array, "n parts channels bins"], Float[Array, "n parts channels bins"] | None]:
+    def counts(self, observation: Seen, states: BoxState) -> tuple[Histograms, Histograms | None]:
         """Pixels of each colour in each box, and at its sides where `contrast` is positive."""
         num_parts = self.references.shape[1]
         observation, boxes = self.prepare_observation(observation), self.boxes(states)
@@ -277,10 +273,10 @@ class ColourModel(AbstractBoxModel):
 
     def distances(
         self,
-        counts: Float[Array, "n parts channels bins"],
-        sides: Float[Array, "n parts channels bins"] | None,
-        weights: Float[Array, "#n parts channels bins"],
-        references: Float[Array, "#n parts channels bins"],
+        counts: Histograms,
+        sides: Histograms | None,
+        weights: Histograms,
+        references: Histograms,
     ) -> Float[Array, " n"]:
         """Σ_c B² - contrast Σ_c B²_around of boxes with these counts, from these references."""
         distances = _distances(counts, weights, references)
@@ -290,9 +286,7 @@ class ColourModel(AbstractBoxModel):
         around = jnp.where(uncounted, 0.0, _distances(sides, weights, references))
         return distances - self.contrast * around
 
-    def own(
-        self, states: BoxState
-    ) -> tuple[Float[Array, "#n parts channels bins"], Float[Array, "#n parts channels bins"]]:
+    def own(self, states: BoxState) -> tuple[Histograms, Histograms]:
         """The weights of colours and the references of the particles."""
         weights, references = self.colour_weights, self.references
         # With one reference, a gather costs more than the distance. Under vmap, where
@@ -303,9 +297,7 @@ class ColourModel(AbstractBoxModel):
 
 
 def _distances(
-    counts: Float[Array, "n parts channels bins"],
-    weights: Float[Array, "#n parts channels bins"],
-    references: Float[Array, "#n parts channels bins"],
+    counts: Histograms, weights: Histograms, references: Histograms
 ) -> Float[Array, " n"]:
     """Σ_c B² of counted colours from references, averaged over the bands."""
     histograms = normalise(counts, weights)

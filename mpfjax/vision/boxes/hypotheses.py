@@ -6,15 +6,15 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.checks import check
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation, Step, is_missing
 from mpfjax.moves.objects.exclusion import AbstractExclusion
 from mpfjax.moves.regrouping.features import component_groups
-from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
-from mpfjax.vision.colour.histograms import IntegralHistogram, normalise
+from mpfjax.vision.boxes.colour_model import BoxState, ColourModel, Seen
+from mpfjax.vision.colour.histograms import Histograms, normalise
 
 
 class LearnedColourModel(ColourModel):
@@ -43,19 +43,12 @@ class LearnedColourModel(ColourModel):
         states = super().sample_initial(key, num_particles)
         return dataclasses.replace(states, appearance=self.references[states.reference])
 
-    def log_likelihood(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
-    ) -> Float[Array, " n"]:
+    def log_likelihood(self, observation: Seen, states: BoxState) -> Float[Array, " n"]:
         """log of the sum of the two terms, visible and hidden."""
         log_seen, log_hidden, _ = self._seen(observation, states)
         return jnp.logaddexp(log_seen, log_hidden)
 
-    def learned(
-        self,
-        observation: IntegralHistogram | UInt8[Array, "h w 3"],
-        states: BoxState,
-        rate: float,
-    ) -> BoxState:
+    def learned(self, observation: Seen, states: BoxState, rate: float) -> BoxState:
         """The states, after rate · P(seen | x, y) (h(x) - appearance) is added to appearances."""
         log_seen, log_hidden, counts = self._seen(observation, states)
         shown = normalise(counts, self.own(states)[0])
@@ -68,8 +61,8 @@ class LearnedColourModel(ColourModel):
         return dataclasses.replace(states, appearance=past + share * change)
 
     def _seen(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
-    ) -> tuple[Float[Array, " n"], Float[Array, ""], Float[Array, "n parts channels bins"]]:
+        self, observation: Seen, states: BoxState
+    ) -> tuple[Float[Array, " n"], Float[Array, ""], Histograms]:
         """log of the two terms of the likelihood, and the colours in the boxes."""
         counts, sides = self.counts(observation, states)
         weights, references = self.own(states)
@@ -107,9 +100,8 @@ class AdaptAppearance(AbstractPropagation):
         if is_missing(now):
             return mixture
         model: Any = now.model
-        return mixture.replace(
-            particles=model.learned(now.observation, mixture.particles, self.rate)
-        )
+        particles = model.learned(now.observation, mixture.particles, self.rate)
+        return mixture.replace(particles=particles)
 
 
 class ObjectExclusion(AbstractExclusion):

@@ -40,7 +40,7 @@ def paper_filters(
 ) -> dict[str, Filter]:
     """The paper's model and parameters; thresholds of the MPF are in units of the mean box."""
     size = boxes[:, 2:].mean(axis=0)
-    model = ColourModel.from_frame(frame, boxes, sigma=0.15, deviations=None, share_reference=True)
+    model = ColourModel.from_frame(frame, boxes, sigma=0.15, share_reference=True)
     where: dict[str, Any] = {"features": _centre, "scale": size}
     merge, split = Merge(None, 0.5, **where), Split(4.0, 0.5, min_share=0.15, **where)
     mixture = mixture_particle_filter(

@@ -14,6 +14,8 @@ from mpfjax.operations.stored import stored
 from mpfjax.vision.colour.bins import AbstractColours
 from mpfjax.vision.files.frames import check_frame
 
+Histograms = Float[Array, "#n parts channels bins"]
+
 SURROUND = 2.0
 # A box of more pixels cannot be counted in 16 bits.
 LARGEST_NARROW = 2**16 - 1
@@ -49,9 +51,7 @@ class IntegralHistogram(eqx.Module):
         """The most pixels a box may hold and still be counted exactly."""
         return int(min(np.iinfo(self.table.dtype).max, np.iinfo(np.int32).max))
 
-    def counts(
-        self, boxes: Float[Array, "n 4"], num_parts: int = 1
-    ) -> Float[Array, "n parts channels bins"]:
+    def counts(self, boxes: Float[Array, "n 4"], num_parts: int = 1) -> Histograms:
         """Pixels of each colour in each box, cut into `num_parts` bands from top to bottom.
 
         Boxes are (x, y, w, h) about their centre, in pixels, and the frame spans [0, width] x [0,
@@ -122,9 +122,7 @@ def bhattacharyya(
 
 
 @partial(jax.jit, static_argnames=("wide_counts", "soon"))
-def _table(
-    frame: UInt8[Array, "h w 3"], colours: AbstractColours, wide_counts: bool, soon: bool
-) -> Array:
+def _table(frame, colours, wide_counts, soon):
     width = frame.shape[1]
     dtype = jnp.dtype(jnp.uint32 if wide_counts else jnp.uint16)
     columns = -(-(width + 1) // _BLOCK) * _BLOCK
@@ -142,7 +140,10 @@ def _table(
     table = jax.lax.scan(add_row, above, bins)[1]
     if not soon:
         return table
-    add_left = lambda k, table: table.at[:, k].add(table[:, k - 1])  # noqa: E731
+
+    def add_left(k: Int[Array, ""], table: Array) -> Array:
+        return table.at[:, k].add(table[:, k - 1])
+
     return jax.lax.fori_loop(1, columns, add_left, table)
 
 
@@ -199,7 +200,7 @@ def reference_histograms(
     places: Float[Array, "k 4"],
     num_parts: int,
     weigh_colours: bool,
-) -> tuple[Float[Array, "k parts channels bins"], Float[Array, "k parts channels bins"]]:
+) -> tuple[Histograms, Histograms]:
     """The normalised histograms of the reference boxes, and the weights of their colours."""
     # NumPy counts: boxes differ in size, and a program for each would have to be compiled.
     bins, inner, outer = map(np.asarray, _sorted(jnp.asarray(frame), colours, places, num_parts))
@@ -211,11 +212,7 @@ def reference_histograms(
 
 
 @eqx.filter_jit
-def _weighed(
-    counts: Float[Array, "k parts channels bins"],
-    within: Float[Array, "k 1 channels bins"],
-    weigh_colours: bool,
-) -> tuple[Float[Array, "k parts channels bins"], Float[Array, "k parts channels bins"]]:
+def _weighed(counts, within, weigh_colours):
     """Histograms by the counts in boxes and in their surroundings, and the weights of colours."""
     weights = jnp.ones_like(counts)
     if weigh_colours:
@@ -227,12 +224,7 @@ def _weighed(
 
 
 @eqx.filter_jit
-def _sorted(
-    frame: UInt8[Array, "h w 3"],
-    colours: AbstractColours,
-    places: Float[Array, "k 4"],
-    num_parts: int,
-) -> tuple[Int[Array, "h w channels"], Int[Array, "k inner"], Int[Array, "k outer"]]:
+def _sorted(frame, colours, places, num_parts):
     """The bin of each pixel; the edges of each box and its bands, and those of its surroundings.
 
     The edges of a box are the rows at which its bands begin and end, its first column and its end.
