@@ -455,9 +455,10 @@ def _rule(hint: Any) -> Rule | None:
         return next((extra for extra in choices[1:] if isinstance(extra, Rule)), None)
     if origin in (typing.Union, types.UnionType):
         known = [rule for choice in choices if (rule := _rule(choice)) is not None]
-        holds = lambda value: any(rule.holds(value) for rule in known)  # noqa: E731
+        if len(known) < len(choices):
+            return None
         what = " or ".join(rule.what for rule in known)
-        return Rule(holds, what) if len(known) == len(choices) else None
+        return Rule(lambda value: any(rule.holds(value) for rule in known), what)
     if origin is Literal:
         return one_of(choices)
     if origin is Callable:

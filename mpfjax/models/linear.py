@@ -80,9 +80,8 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
         """x_0 ~ N(m0, P0)."""
-        return self.initial_from_noise(
-            normal(key, (num_particles, self.initial_noise_dimension), self.m0.dtype)
-        )
+        noise = normal(key, (num_particles, self.initial_noise_dimension), self.m0.dtype)
+        return self.initial_from_noise(noise)
 
     @property
     def initial_noise_dimension(self) -> int:

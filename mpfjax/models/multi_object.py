@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import POSITIVE, Count, Fitting, check_one_each, checked, to_array
+from mpfjax.checks import POSITIVE, Checked, Count, Fitting, check_one_each, to_array
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -29,7 +29,7 @@ from mpfjax.operations.rows import select_rows
 _TRIAL = 1_000_003
 
 
-class MultiObjectModel(AbstractStateSpaceModel):
+class MultiObjectModel(AbstractStateSpaceModel, Checked):
     """x_t = (x_t^1, ..., x_t^J): J objects, each with its own dynamics and likelihood.
 
     Smith and Gatica-Perez (2004), section 2: D is a product over the objects, and so is
@@ -59,32 +59,21 @@ class MultiObjectModel(AbstractStateSpaceModel):
     """
 
     object_model: AbstractStateSpaceModel
-    num_objects: int = eqx.field(static=True)
-    interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None
-    shared_observation: bool = eqx.field(static=True)
-    per_object: bool = eqx.field(static=True)
-    shared_inputs: bool = eqx.field(static=True)
+    num_objects: Count = eqx.field(static=True)
+    interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None = None
+    shared_observation: bool = eqx.field(static=True, default=False)
+    per_object: bool | None = eqx.field(static=True, default=None, kw_only=True)
+    shared_inputs: bool = eqx.field(static=True, default=True, kw_only=True)
 
-    @checked
-    def __init__(
-        self,
-        object_model: AbstractStateSpaceModel,
-        num_objects: Count,
-        interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None = None,
-        shared_observation: bool = False,
-        *,
-        per_object: bool | None = None,
-        shared_inputs: bool = True,
-    ) -> None:
-        refuse_marginalised(object_model, "MultiObjectModel", "give each a filter", "object_model")
-        self.object_model, self.num_objects = object_model, int(num_objects)
-        self.interaction, self.shared_inputs = interaction, shared_inputs
-        self.shared_observation = shared_observation
-        if per_object is None:
-            per_object = _finds_object_axis(object_model, self.num_objects)
-        elif per_object and not _has_axis(object_model, self.num_objects):
-            raise ValueError(f"object_model: not every array has a leading axis of {num_objects}")
-        self.per_object = per_object
+    def __post_init__(self) -> None:
+        self.__check_init__()
+        model, number = self.object_model, int(self.num_objects)
+        refuse_marginalised(model, "MultiObjectModel", "give each a filter", "object_model")
+        if self.per_object is None:
+            self.per_object = _finds_object_axis(model, number)
+        elif self.per_object and not _has_axis(model, number):
+            raise ValueError(f"object_model: not every array has a leading axis of {number}")
+        self.num_objects = number
 
     @property
     def handles_missing(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -39,7 +39,7 @@ def coupled(
         i, j = pair
 
         def look() -> Bool[Array, ""]:
-            over_pairs = jax.vmap(of_one(interaction), in_axes=(0, None))
+            over_pairs = jax.vmap(partial(_with_each, interaction), in_axes=(0, None))
             log_psi = over_pairs(*(model.object_states(points, k) for k in pair))
             return jnp.any(log_psi != 0)
 
@@ -58,16 +58,10 @@ def together(labels: Int[Array, " objects"]) -> Bool[Array, "objects objects"]:
     return labels[:, None] == labels[None]
 
 
-def of_one(
-    function: Callable[[PyTree, PyTree], Float[Array, " n"]],
-) -> Callable[[PyTree, PyTree], Float[Array, " n"]]:
-    """Turn a function of the states of equal rows into one of one state and many others."""
-
-    def with_each(state: PyTree, others: PyTree) -> Float[Array, " n"]:
-        repeated = jax.tree.map(lambda a, b: jnp.broadcast_to(a[None], b.shape), state, others)
-        return function(repeated, others)
-
-    return with_each
+def _with_each(function: Callable[..., Array], state: PyTree, others: PyTree) -> Array:
+    """A function of the states of equal rows, of one state and many others."""
+    repeated = jax.tree.map(lambda a, b: jnp.broadcast_to(a[None], b.shape), state, others)
+    return function(repeated, others)
 
 
 def scores(
@@ -158,8 +152,11 @@ def _log_kernels(
     model: MultiObjectModel, j: Int[Array, ""], parent: PyTree, points: PyTree
 ) -> Float[Array, " n"]:
     """log f_j of the points of one object given one parent."""
-    log_f = of_one(lambda parent, points: model.object_log_transition(points, parent, j))
-    return log_f(parent, points).astype(default_float())
+
+    def log_f(parents: PyTree, points: PyTree) -> Float[Array, " n"]:
+        return model.object_log_transition(points, parents, j)
+
+    return _with_each(log_f, parent, points).astype(default_float())
 
 
 def _log_potentials(
@@ -170,7 +167,7 @@ def _log_potentials(
     total = jnp.zeros((num, num), default_float())
     if interaction is None:
         return total
-    of_row = jax.vmap(of_one(interaction))
+    of_row = jax.vmap(partial(_with_each, interaction))
 
     def add(total: Float[Array, "n n"], inputs: tuple) -> tuple[Float[Array, "n n"], None]:
         i, meets = inputs

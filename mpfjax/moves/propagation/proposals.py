@@ -185,12 +185,8 @@ class GaussNewtonProposal(_GaussianProposal):
     ) -> Float[Array, " n"]:
         """log q of draws that were made of this noise."""
         log_scale = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
-        log_density = (
-            log_scale
-            - noise.shape[1] * (jnp.log(self.inflation) + 0.5 * jnp.log(2 * jnp.pi))
-            - 0.5 * jnp.sum(noise**2, axis=1)
-        )
-        return log_density.astype(noise.dtype)
+        log_unit = noise.shape[1] * (jnp.log(self.inflation) + 0.5 * jnp.log(2 * jnp.pi))
+        return (log_scale - log_unit - 0.5 * jnp.sum(noise**2, axis=1)).astype(noise.dtype)
 
     def log_normaliser(
         self, now: Step, previous_states: Float[Array, "n ..."]
@@ -204,12 +200,10 @@ class GaussNewtonProposal(_GaussianProposal):
         """
         model: Any = now.model
         prior_means, means, factors = self._fit(now, previous_states)
-        seen = model.observation_mean(means.reshape(prior_means.shape))
+        seen = model.observation_mean(means.reshape(prior_means.shape)).reshape(len(means), -1)
         covariance_y = _matrix(model.observation_covariance).astype(means.dtype)
         covariance = _matrix(model.transition_covariance).astype(means.dtype)
-        missed = jnp.atleast_1d(now.observation).astype(means.dtype)[None] - seen.reshape(
-            means.shape[0], -1
-        )
+        missed = jnp.atleast_1d(now.observation).astype(means.dtype)[None] - seen
         moved = means - prior_means.reshape(means.shape)
         squares = jnp.einsum("np,pq,nq->n", missed, _inverse(covariance_y), missed)
         squares = squares + jnp.einsum("nd,de,ne->n", moved, _inverse(covariance), moved)

@@ -101,10 +101,8 @@ class GroupBy(AbstractRegrouping):
         if jnp.shape(labels) != (n,) or not jnp.issubdtype(dtype, jnp.integer):
             what = f"not one whole number a particle, ({n},)"
             raise ValueError(f"function: it returned {shown(labels)}, {what}")
-        num_labels = mixture.num_components
-        outside = mixture.occupied & ((labels < 0) | (labels >= num_labels))
-        inside = jnp.clip(labels, 0, num_labels - 1).astype(jnp.int32)
-        message = (
-            f"GroupBy: function gave a label outside [0, {num_labels}), the filter's num_components"
-        )
+        m = mixture.num_components
+        outside = mixture.occupied & ((labels < 0) | (labels >= m))
+        inside = jnp.clip(labels, 0, m - 1).astype(jnp.int32)
+        message = f"GroupBy: function gave a label outside [0, {m}), the filter's num_components"
         return eqx.error_if(inside, jnp.any(outside), message), mixture.memory

@@ -66,9 +66,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         key_offset, key_noise = jax.random.split(key)
         offset = jax.random.randint(key_offset, (), 0, num_particles)
         reference = (jnp.arange(num_particles) * k + offset) // num_particles % k
-        centre = jnp.concatenate(
-            [self.reference_boxes[:, :2], jnp.ones_like(self.reference_boxes[:, :2])], axis=1
-        )
+        centre = self.reference_boxes.at[:, 2:].set(1.0)
         noise = jax.random.normal(key_noise, (num_particles, 4), centre.dtype)
         box = centre[reference] + self.initial_deviations[reference] * noise
         states = BoxState(box, reference)
@@ -108,9 +106,8 @@ class AbstractBoxModel(AbstractStateSpaceModel):
     def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
         """log D(x_t | x_{t-1}) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
         dynamics = self.dynamics_of(previous_states)
-        log_density = dynamics.log_density(
-            states.box, previous_states.box, previous_states.previous
-        )
+        current, previous = previous_states.box, previous_states.previous
+        log_density = dynamics.log_density(states.box, current, previous)
         drawn = self.switch_probability / self.reference_boxes.shape[0]
         stays = states.reference == previous_states.reference
         probability = jnp.where(stays, 1 - self.switch_probability + drawn, drawn)
