@@ -12,13 +12,11 @@ from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import Count, CountOrZero, checked, to_rows
 from mpfjax.filter import Filter
-from mpfjax.mixture import ParticleMixture
-from mpfjax.models.observations import Fault, one_observation, raise_faults
+from mpfjax.models.observations import one_observation, raise_faults
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
 from mpfjax.operations.random import split_once
 from mpfjax.vision.boxes.hypotheses import LearnedColourModel, best_components, component_references
 from mpfjax.vision.boxes.recipes import objects_filters
-from mpfjax.vision.colour.histograms import IntegralHistogram
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing
 from mpfjax.vision.files.frames import of_one_kind
@@ -172,32 +170,20 @@ def follow_boxes(
     little = in_little_memory(soon=True)
     mixture = jit_with(little, Filter.init)(filter, key)
     # With XLA's newer emitters it takes longer to compile, and half the time to run.
-    count = jit_with(cpu_options(soon=True), _counted)
+    count = jit_with(cpu_options(soon=True), LearnedColourModel.prepare_observation)
     advance = jit_with(little, _advance_boxes)
     for t, still in enumerate(itertools.chain([first], stills)):
         # An array: each new Python number would compile anew.
-        counted = count(model, still)
+        counted = count(model, still, soon=True)
         mixture, tracks, faults = advance(filter, len(boxes), key, np.asarray(t), mixture, counted)
         yield jax.device_get(raise_faults(tracks, faults))
 
 
-def _counted(model: LearnedColourModel, frame: Array) -> IntegralHistogram:
-    return model.prepare_observation(frame, soon=True)
-
-
-def _advance_boxes(
-    filter: Filter,
-    num_objects: int,
-    key: Array,
-    t: Array,
-    mixture: ParticleMixture,
-    counted: IntegralHistogram,
-) -> tuple[ParticleMixture, Tracks, tuple[Fault, ...]]:
+def _advance_boxes(filter, num_objects, key, t, mixture, counted):
     step_keys = split_once(jax.random.fold_in(key, t), len(filter.moves))
-    model: Any = filter.model
     mixture, _, faults = filter._step_and_faults(step_keys, mixture, counted)
     best, held = best_components(mixture, num_objects)
-    means = mixture.component_averages(model.boxes(mixture.particles))
+    means = mixture.component_averages(filter.model.boxes(mixture.particles))
     identities = jnp.where(held, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)
     unseen = jnp.zeros(num_objects, jnp.int32)
     none, never = jnp.full(num_objects, -1, jnp.int32), jnp.zeros(num_objects)

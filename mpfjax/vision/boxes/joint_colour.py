@@ -1,6 +1,7 @@
 """Several objects, each recognised by its colours, as in Smith and Gatica-Perez (2004)."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -63,30 +64,17 @@ def joint_colour_model(
     steps = positive_deviations(deviations, 1).reshape(4)
     momentum = Autoregression.with_momentum(_MOMENTUM, jnp.asarray(steps, float))
 
-    def learn(frame: np.ndarray, boxes: np.ndarray) -> ColourModel:
-        return ColourModel.from_frame(
-            frame,
-            boxes,
-            colours=HSVColours() if colours is None else colours,
-            sigma=sigma,
-            deviations=steps,
-            dynamics=momentum,
-            num_parts=num_parts,
-        )
-
+    learn = partial(
+        ColourModel.from_frame, colours=HSVColours() if colours is None else colours, sigma=sigma,
+        deviations=steps, dynamics=momentum, num_parts=num_parts,
+    )  # fmt: skip
     model = learn(frame, boxes)
     for j, (other_frame, box) in (templates or {}).items():
         if j not in range(len(boxes)):
             raise ValueError(f"templates: {j} is none of the {len(boxes)} objects, from 0 on")
         looks = learn(other_frame, to_rows(4, "templates", box)[:1]).references[0]
         model = eqx.tree_at(lambda m: m.references, model, model.references.at[j].set(looks))
-    return MultiObjectModel(
-        _one_each(model),
-        len(boxes),
-        interaction,
-        shared_observation=True,
-        per_object=True,
-    )
+    return MultiObjectModel(_one_each(model), len(boxes), interaction, True, per_object=True)
 
 
 @checked

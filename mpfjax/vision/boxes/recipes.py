@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, UInt8
 
 from mpfjax.filter import Filter
 from mpfjax.filters import mixture_particle_filter, particle_filter
-from mpfjax.models.dynamics import AbstractDynamics, RandomWalkWithJumps, WalkWithVelocity
+from mpfjax.models.dynamics import RandomWalkWithJumps, WalkWithVelocity
 from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.regrouping.kmeans import KMeans
@@ -33,6 +33,11 @@ from mpfjax.vision.colour.bins import RGBColours
 
 NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
 HYPOTHESES, PARTICLES_PER_HYPOTHESIS = 3, 40
+# Each box is a reference.
+_OWN_REFERENCES: dict[str, Any] = {
+    "colours": RGBColours(16), "sigma": 0.2, "num_parts": 8, "weigh_colours": True,
+    "contrast": 0.25,
+}  # fmt: skip
 
 
 def paper_filters(
@@ -66,8 +71,11 @@ def default_filters(
     """
     size = boxes[:, 2:].mean(axis=0)
     steps = _steps(boxes)
-    walk = _with_jumps(steps, probability=0.05)
-    model = _own_references(frame, boxes, steps, walk, switch_probability=0.05)
+    # Some steps of the places are longer by a factor; sizes never jump.
+    walk = RandomWalkWithJumps(steps, steps * np.array([6.0, 6.0, 1.0, 1.0]), 0.05)
+    model = ColourModel.from_frame(
+        frame, boxes, deviations=steps, dynamics=walk, switch_probability=0.05, **_OWN_REFERENCES
+    )
     where: dict[str, Any] = {"features": _centre, "scale": size}
     mixture = Filter(
         model,
@@ -104,11 +112,13 @@ def objects_filters(
     size = boxes[:, 2:].mean(axis=0)
     # Steps about a velocity are shorter than those of a random walk.
     steps = _steps(boxes) * np.array([0.3, 0.5, 1.0, 1.0])
-    walk = _with_jumps(steps, probability=0.1, times=(8.0, 6.0))
+    walk = RandomWalkWithJumps(steps, steps * np.array([8.0, 6.0, 1.0, 1.0]), 0.1)
     # Places keep their velocity, which is about a tenth of a width a frame at first.
     speeds = 0.1 * boxes[:, 2:3] * np.array([[1.0, 1.0, 0.0, 0.0]])
     walk = WalkWithVelocity(walk, (0.1, 0.1, 0.0, 0.0), speeds)
-    model: Any = _own_references(frame, boxes, steps, walk, kind=LearnedColourModel)
+    model = LearnedColourModel.from_frame(
+        frame, boxes, deviations=steps, dynamics=walk, **_OWN_REFERENCES
+    )
     apart = _apart(size)
     learn = AdaptAppearance(rate=0.03)
     num_components = most_components(len(boxes))
@@ -139,41 +149,10 @@ def most_components(num_objects: int) -> int:
     return max(MAX_COMPONENTS, HYPOTHESES * num_objects)
 
 
-def _own_references(
-    frame: np.ndarray,
-    boxes: np.ndarray,
-    deviations: np.ndarray,
-    dynamics: AbstractDynamics,
-    *,
-    kind: type[ColourModel] = ColourModel,
-    switch_probability: float = 0.0,
-) -> ColourModel:
-    """Each box is a reference."""
-    return kind.from_frame(
-        frame,
-        boxes,
-        colours=RGBColours(16),
-        sigma=0.2,
-        deviations=deviations,
-        dynamics=dynamics,
-        num_parts=8,
-        weigh_colours=True,
-        switch_probability=switch_probability,
-        contrast=0.25,
-    )
-
-
 def _steps(boxes: np.ndarray) -> np.ndarray:
     """Deviations of the random walk: 0.4 widths, 0.08 heights of each box; sizes hardly change."""
     still = np.full(len(boxes), 0.01)
     return np.stack([0.4 * boxes[:, 2], 0.08 * boxes[:, 3], still, still], axis=1)
-
-
-def _with_jumps(
-    steps: np.ndarray, probability: float, times: tuple[float, float] = (6.0, 6.0)
-) -> RandomWalkWithJumps:
-    """Some steps of the places are longer by this factor; sizes never jump."""
-    return RandomWalkWithJumps(steps, steps * np.array([*times, 1.0, 1.0]), probability)
 
 
 def _apart(size: np.ndarray) -> dict[str, Any]:
