@@ -27,24 +27,16 @@ from mpfjax.moves.start.start import Begin, Start
 
 
 @checked
-def map_moves(change: Callable[[Any], Any], filter: Filter) -> Filter:
+def map_moves(change: Callable[[Any], Any], filter: Filter, *, within: bool = True) -> Filter:
     """The filter with `change(move)` in the place of each move.
 
     It reaches the moves that others hold first, as those of an `Every`, and the resampling within a
     `Partitioned`:
 
         map_moves(lambda m: Resample("ssp") if isinstance(m, Resample) else m, filter)
+
+    - `within`: whether also those that propagations hold, or the chain's own moves alone.
     """
-    return _changed(change, filter, within=True)
-
-
-def _map_chain(change: Callable[[Any], Any], filter: Filter) -> Filter:
-    """The same of the chain's own moves alone, not of those that propagations hold."""
-    return _changed(change, filter, within=False)
-
-
-def _changed(change: Callable[[Any], Any], filter: Filter, within: bool) -> Filter:
-    """The filter with its moves changed, those that they hold first, also `within` propagations."""
 
     def changed(move: AbstractMove) -> Any:
         enters = within or not isinstance(move, AbstractPropagation)
@@ -54,6 +46,11 @@ def _changed(change: Callable[[Any], Any], filter: Filter, within: bool) -> Filt
         moves=[changed(move) for move in filter.moves],
         initial_moves=[changed(move) for move in filter.initial_moves],
     )
+
+
+def _map_kind(kind: Any, change: Callable[[Any], Any], filter: Filter) -> Filter:
+    """The same of the chain's own moves of this kind alone."""
+    return map_moves(lambda m: change(m) if isinstance(m, kind) else m, filter, within=False)
 
 
 def _require_resample(filter: Filter, what: str) -> None:
@@ -69,7 +66,7 @@ def with_resampling(filter: Filter, resample: Resample) -> Filter:
     Raises `ValueError` for anything but a `Resample`. Use it for other slots of components:
     `with_resampling(filter, Resample(allocation="equal"))`.
     """
-    return _map_chain(lambda move: resample if isinstance(move, Resample) else move, filter)
+    return _map_kind(Resample, lambda move: resample, filter)
 
 
 @checked
@@ -82,12 +79,10 @@ def with_point_sets(filter: Filter) -> Filter:
     where masses of modes and likelihoods must be accurate.
     """
 
-    def in_order(move: Any) -> Any:
-        if isinstance(move, Resample) and move.sort_by is None:
-            return dataclasses.replace(move, sort_by=HILBERT)
-        return move
+    def in_order(move: Resample) -> Resample:
+        return dataclasses.replace(move, sort_by=HILBERT) if move.sort_by is None else move
 
-    ordered = _map_chain(in_order, filter)
+    ordered = _map_kind(Resample, in_order, filter)
     return _everywhere(ordered, "noise", "rqmc").replace(initial_noise="rqmc")
 
 
@@ -111,13 +106,11 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
     """
     require_propagation(filter._now(None), "each particle draws")
 
-    def nested(move: Any) -> Any:
-        if not isinstance(move, AbstractPropagationOfEach):
-            return move
+    def nested(move: AbstractPropagationOfEach) -> AbstractPropagationOfEach:
         plain: Any = move.propagate if isinstance(move, PropagateNested) else move
         return plain if num_draws == 1 else PropagateNested(plain, num_draws)
 
-    return _map_chain(nested, filter)
+    return _map_kind(AbstractPropagationOfEach, nested, filter)
 
 
 @checked
@@ -128,19 +121,15 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
     that is a proposal also draws x_t, where the filter has no other. Raises `ValueError` for a
     filter without `Resample`.
     """
-    plain = _map_chain(lambda m: m.resample if isinstance(m, AuxiliaryResample) else m, filter)
+    plain = _map_kind(AuxiliaryResample, lambda move: move.resample, filter)
     look = PilotLookahead() if lookahead is None else lookahead
     _require_resample(plain, "which could look ahead")
 
-    def ahead(move: Any) -> Any:
-        if isinstance(move, Resample):
-            return AuxiliaryResample(move, look)
-        guided = isinstance(look, AbstractProposal) and isinstance(move, Propagate)
-        if guided and move.proposal is None:
-            return dataclasses.replace(move, proposal=look)
-        return move
+    def guided(move: Propagate) -> Propagate:
+        return dataclasses.replace(move, proposal=look) if move.proposal is None else move
 
-    return _map_chain(ahead, plain)
+    ahead = _map_kind(Resample, lambda move: AuxiliaryResample(move, look), plain)
+    return _map_kind(Propagate, guided, ahead) if isinstance(look, AbstractProposal) else ahead
 
 
 @checked
@@ -211,9 +200,6 @@ def with_restarts(
     _require_resample(filter, "with which a state begins anew")
     settings = {"probability": probability, "share": share, "num_draws": num_draws}
 
-    def changed(move: Any) -> Any:
-        return dataclasses.replace(move, **settings) if isinstance(move, Restart) else move
-
     def restarting(move: Any) -> Any:
         if isinstance(move, Start):
             return move.map_inner(restarting)
@@ -221,7 +207,7 @@ def with_restarts(
         return Restart(move, **settings) if is_own else _apart(move)
 
     if _has(filter, Restart):
-        return _map_chain(changed, filter)
+        return _map_kind(Restart, lambda move: dataclasses.replace(move, **settings), filter)
     return filter.replace(
         moves=[restarting(move) for move in filter.moves if not isinstance(move, WatchStart)],
         initial_moves=[_apart(move) for move in filter.initial_moves],

@@ -141,9 +141,6 @@ def require(model: Any, method: str, needed_by: str, argument: str = "model") ->
         raise ValueError(f"{argument}: {who} defines no {method}, which {needed_by} needs{hint}")
 
 
-_FROM_NOISE = AbstractStateSpaceModel.sample_transition
-
-
 def model_name(model: Any) -> str:
     """The name of the user's own class, whether `per_particle` wraps it or not."""
     return type(_own(model)).__name__
@@ -178,8 +175,8 @@ class _ModelRule(Rule):
 
     def check(self, value: Any, name: str) -> None:
         """Raise a `ValueError` that says what is missing."""
-        law = "sample_transition"
-        if getattr(type(value), law, None) is _FROM_NOISE and not hasattr(value, "latent_dynamics"):
+        law, of_noise = "sample_transition", AbstractStateSpaceModel.sample_transition
+        if getattr(type(value), law, None) is of_noise and not hasattr(value, "latent_dynamics"):
             law = "transition_from_noise"
             if not hasattr(value, law):
                 who = f"{name}: {model_name(value)} defines no sample_transition"
