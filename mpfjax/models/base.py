@@ -135,7 +135,7 @@ def require(model: Any, method: str, needed_by: str, argument: str = "model") ->
         raise ValueError(f"{argument}: a {type(model).__name__} is no model, and holds one, .model")
     if not callable(getattr(model, method, None)):
         who = shown(model) if model is None else model_name(model)
-        taken = {*BATCHED, *SHARED, *vars(AbstractStateSpaceModel)}
+        taken = {*_BATCHED, *_SHARED, *vars(AbstractStateSpaceModel)}
         close = difflib.get_close_matches(method, vars(type(_own(model))).keys() - taken, 1)
         hint = f"; is {close[0]} meant for it?" if close else ""
         raise ValueError(f"{argument}: {who} defines no {method}, which {needed_by} needs{hint}")
@@ -223,12 +223,12 @@ def real_each(values: Any, num_particles: int, asked: Any, method: str = "") -> 
 
 
 # Optional attributes beside the three methods: functions of one particle, and those that all
-# particles share. Those with "observation" in their name are of y_t, the others of x alone.
-BATCHED = (
+# particles share.
+_BATCHED = (
     "log_transition", "log_initial", "with_history", "initial_from_noise", "transition_from_noise",
     "transition_mean", "observation_mean", "sample_observation",
 )  # fmt: skip
-SHARED = (
+_SHARED = (
     "transition_covariance", "observation_covariance", "prepare_observation", "noise_dimension",
     "initial_noise_dimension", "periods",
 )  # fmt: skip
@@ -261,9 +261,9 @@ class _PerParticleModel(AbstractStateSpaceModel):
         # Only reached for names that the class lacks: the densities and means that a proposal
         # looks for are there exactly when the wrapped model has them.
         model = self.__dict__.get("model")
-        if name in BATCHED and hasattr(model, name):
+        if name in _BATCHED and hasattr(model, name):
             return _OverParticles(getattr(model, name), draws=name == "sample_observation")
-        if name in SHARED and hasattr(model, name):
+        if name in _SHARED and hasattr(model, name):
             return getattr(model, name)
         raise AttributeError(f"{type(model).__name__} (per_particle) has no attribute {name!r}")
 

@@ -10,8 +10,6 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import POSITIVE, SHARES, Fitting, to_array
 from mpfjax.models.base import (
-    BATCHED,
-    SHARED,
     AbstractStateSpaceModel,
     is_made_of_noise,
     mapped,
@@ -22,8 +20,12 @@ from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.steps import own_likelihoods
 from mpfjax.operations.logarithms import log_or_nothing
 
-# What the object's model may say of its states.
-_PASSED_ON = tuple(name for name in (*BATCHED, *SHARED) if "observation" not in name)
+# What the object's model has beside its three methods and its likelihood of one measurement.
+_PASSED_ON = (
+    "log_transition", "log_initial", "with_history", "initial_from_noise", "transition_from_noise",
+    "initial_noise_dimension", "noise_dimension", "transition_mean", "transition_covariance",
+    "periods",
+)  # fmt: skip
 
 
 def _number_or_function(name: str) -> Callable[[Any], Any]:

@@ -48,14 +48,8 @@ def paper_filters(
     model = ColourModel.from_frame(frame, boxes, sigma=0.15, share_reference=True)
     where: dict[str, Any] = {"features": _centre, "scale": size}
     merge, split = Merge(None, 0.5, **where), Split(4.0, 0.5, min_share=0.15, **where)
-    mixture = mixture_particle_filter(
-        model,
-        NUM_PARTICLES,
-        MAX_COMPONENTS,
-        regroup=[merge, split, KMeans(5, **where)],
-        regroup_every=1,
-        **where,
-    )
+    where |= {"regroup": [merge, split, KMeans(5, **where)], "regroup_every": 1}
+    mixture = mixture_particle_filter(model, NUM_PARTICLES, MAX_COMPONENTS, **where)
     mixture = with_resampling(mixture, Resample(particles_per_component=PARTICLES_PER_COMPONENT))
     return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
 
@@ -160,11 +154,7 @@ def _apart(size: np.ndarray) -> dict[str, Any]:
     return {"features": _centre_and_reference, "scale": (*size, 1e-5)}
 
 
-PRESETS = {
-    "default": default_filters,
-    "objects": objects_filters,
-    "paper": paper_filters,
-}
+PRESETS = {"default": default_filters, "objects": objects_filters, "paper": paper_filters}
 
 
 def _centre(states: BoxState) -> Array:
