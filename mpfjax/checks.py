@@ -211,8 +211,8 @@ def check_one_each(number: int, of_what: str = "particles", /, **trees: Any) -> 
     for name, tree in trees.items():
         leaves = jax.tree.leaves(tree)
         if not leaves or any(jnp.shape(leaf)[:1] != (number,) for leaf in leaves):
-            found = shown(jax.tree.map(jnp.shape, tree))
-            raise ValueError(f"{name}: shape {found} has no leading axis of {number} {of_what}")
+            shapes = shown(jax.tree.map(jnp.shape, tree))
+            raise ValueError(f"{name}: shape {shapes} has no leading axis of {number} {of_what}")
 
 
 @dataclass(frozen=True)

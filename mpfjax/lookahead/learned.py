@@ -102,8 +102,7 @@ def _knowing_nothing(
 ) -> Twist:
     """ψ = 1 at every step."""
     model: Any = filter.model
-    start = lambda key: with_moments(model, model.sample_initial(key, 2))  # noqa: E731
-    states = jax.eval_shape(start, key)
+    states = jax.eval_shape(lambda key: with_moments(model, model.sample_initial(key, 2)), key)
     num_features = math.prod(jax.eval_shape(features, states).shape[1:])
     size, dtype = filter.num_components, noise_dtype(states)
     noise = jax.eval_shape(lambda states: jnp.zeros(noise_dimension(model, states)), states)
@@ -139,5 +138,5 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
         if sum(isinstance(move, kind) for move in moves) != 1:
             raise ValueError(f"filter: its moves need one {needed}, in the chain itself")
     start = TwistInitial(twist, filter.initial_noise)
-    kept = [ahead(move) for move in filter.initial_moves if not move.weighs]
-    return filter.replace(moves=moves, num_particles=num_particles, initial_moves=[start, *kept])
+    initial_moves = [start, *(ahead(move) for move in filter.initial_moves if not move.weighs)]
+    return filter.replace(moves=moves, num_particles=num_particles, initial_moves=initial_moves)

@@ -270,13 +270,13 @@ def _regressed(
     # The better the fit and the larger the sample, the less it is regularised.
     noisy = weights @ (targets - level - design @ rough) ** 2 * jnp.sum(weights**2)
     held = _RIDGE * ridge + noisy * ridge.at[0, 0].set(0.0)
-    found = jnp.linalg.solve(normal + held, right)
-    slope, upper = found[1 : 1 + size], found[1 + size :]
+    coefficients = jnp.linalg.solve(normal + held, right)
+    slope, upper = coefficients[1 : 1 + size], coefficients[1 + size :]
     upper = jnp.where(is_square, root * upper, upper)
     hessian = jnp.zeros((size, size), dtype).at[rows, columns].set(upper)
     values_, vectors = jnp.linalg.eigh(hessian + jnp.triu(hessian, 1).T)
     hessian = (vectors * jnp.minimum(values_, 0.0)[None]) @ vectors.T
-    constant = level + found[0] - 0.5 * jnp.trace(hessian)
+    constant = level + coefficients[0] - 0.5 * jnp.trace(hessian)
     curved = 0.5 * jnp.sum((standard @ hessian) * standard, axis=1)
     residuals = targets - constant - standard @ slope - curved
     constant = constant + weights @ residuals

@@ -50,8 +50,8 @@ class Twist(AbstractLookahead):
 
     def features_of(self, states: PyTree) -> Float[Array, "n d"]:
         """φ(x) of each particle, a row for each."""
-        found = jnp.asarray(self.features(states))
-        return found.reshape(found.shape[0], -1).astype(noise_dtype(states))
+        features = jnp.asarray(self.features(states))
+        return features.reshape(len(features), -1).astype(noise_dtype(states))
 
     def log_factors(self, mixture: ParticleMixture, now: Step | None = None) -> Float[Array, " n"]:
         """log ν of the next step, whatever y_t is."""
