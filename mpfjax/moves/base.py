@@ -80,23 +80,19 @@ class AbstractMove(Given):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model or numbers of a filter that it cannot work with."""
-        del now, num_particles, num_components
 
     def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
         """Which components the move would resample, for the report of a step; most moves none."""
-        del now
         return jnp.zeros(mixture.num_components, bool)
 
     def initial_memory(
         self, model: AbstractStateSpaceModel, num_components: int
     ) -> dict[str, PyTree]:
         """The initial memory of the move, under its own name; most moves have none."""
-        del model, num_components
         return {}
 
     def around(self, reference: Any) -> "AbstractMove":
         """The move in conditional SMC, which keeps one trajectory, a `Reference`; most cannot."""
-        del reference
         who = f"filter: {type(self).__name__}"
         raise ValueError(f"{who} cannot keep a trajectory, as Resample and Propagate can")
 
@@ -104,7 +100,6 @@ class AbstractMove(Given):
         self, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
     ) -> Float[Array, ""] | None:
         """The report's `log_evidence_against_start` after a step; None of a move that has none."""
-        del mixture, now, increment
         return None
 
     @property
@@ -216,7 +211,6 @@ class AbstractRegrouping(AbstractMove):
 
     def around(self, reference: Any) -> "AbstractRegrouping":
         """The move itself, for which all particles are alike."""
-        del reference
         return self
 
 

@@ -50,7 +50,6 @@ class ConditionalPropagation(AbstractPropagation):
 
     def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """The reference slot, and the time of the particles."""
-        del model, num_components
         time = jnp.zeros((), jnp.int32)
         return {REFERENCE: {"slot": self.reference.first_slot, "time": time}}
 

@@ -84,7 +84,6 @@ class SelectInitial(AbstractMove):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` where no move draws x_1 of each x_0."""
-        del num_particles, num_components
         require_propagation(now, "x_0 is chosen")
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:

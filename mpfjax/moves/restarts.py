@@ -87,7 +87,6 @@ class Restart(AbstractWrapper):
 
     def around(self, reference: Any) -> AbstractMove:
         """Raise a `ValueError`: a trajectory that is kept would have to begin anew."""
-        del reference
         raise ValueError("filter: restarts cannot keep a trajectory, as Resample and Propagate can")
 
     def _most_slots(self, num_particles: int) -> int:
@@ -141,7 +140,6 @@ class Restart(AbstractWrapper):
         self, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
     ) -> Float[Array, ""]:
         """The odds of the draws of x_0 after the step, over p / (1 - p)."""
-        del now, increment
         log_masses = mixture.log_mixture_weights
         anew, others = log_masses[-1], log_sum_exp(log_masses[:-1])
         log_odds = over_all_islands(anew) - over_all_islands(others)
@@ -170,29 +168,24 @@ class WatchStart(AbstractMove):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` where no move draws x_t of each particle."""
-        del num_particles, num_components
         require_propagation(now, "draws of x_0 are compared")
 
     def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """How much has spoken against the hypotheses."""
-        del model, num_components
         return quiet()
 
     def around(self, reference: Any) -> "WatchStart":
         """The move itself, which changes nothing."""
-        del reference
         return self
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """The mixture itself."""
-        del key, now
         return mixture
 
     def evidence_against(
         self, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
     ) -> Float[Array, ""]:
         """log mean p(y_t | x_{t-1}) less the increment; zero where y_t is missing."""
-        del mixture
         if is_missing(now):
             return jnp.zeros_like(increment)
         now = without_gradient(now)

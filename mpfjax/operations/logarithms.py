@@ -35,7 +35,6 @@ def add_gradient(
 
     Without differentiation, the source is not even computed.
     """
-    del source
     return values
 
 

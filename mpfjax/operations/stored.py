@@ -167,7 +167,6 @@ def most_of_runs(number: Int[Array, ""]) -> Int[Array, ""]:
 def _most_of_many_runs(
     axis_size: int, in_batched: list[bool], numbers: Int[Array, " b"]
 ) -> tuple[Int[Array, ""], bool]:
-    del axis_size, in_batched
     # A `vmap` around this one combines its own runs.
     return most_of_runs(jnp.max(numbers)), False
 

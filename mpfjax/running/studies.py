@@ -39,7 +39,6 @@ def log_evidence(run: FilterRun) -> dict[str, Array]:
 
 def nothing(mixture: ParticleMixture) -> None:
     """Collect nothing, the default of a `Study`."""
-    del mixture
 
 
 class Study(Checked):

@@ -52,7 +52,6 @@ class _Propagation(AbstractPropagation):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model that lacks what the arguments need."""
-        del num_particles, num_components
         model, proposal, needs_noise = now.model, self.proposal, self.noise != "independent"
         if proposal is not None:
             proposal.check(now)
@@ -211,18 +210,15 @@ class Reweight(AbstractPropagation):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a part of a marginalised likelihood."""
-        del num_particles, num_components
         if self.exponent != 1:
             refuse_marginalised(now.model, "a part of the likelihood", "take exponent 1")
 
     def around(self, reference: Reference) -> "Reweight":
         """The move itself, which weighs the trajectory as any other."""
-        del reference
         return self
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Reweight every particle by y_t, unless it is missing."""
-        del key
         if is_missing(now):
             return mixture
         if self.exponent == 1:

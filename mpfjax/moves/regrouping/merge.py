@@ -51,14 +51,12 @@ class Merge(AbstractRegrouping, ByFeatures):
 
     def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """How many times in a row each pair of components has overlapped, where patience counts."""
-        del model
         if self.patience == 1:
             return {}
         return {"overlap_durations": jnp.zeros((num_components, num_components), jnp.int32)}
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The lowest label of the chain of overlapping components that each particle is in."""
-        del key
         components, features = mixture.component_indicators, self.features_of(mixture)
         weights = relative_weights(mixture)
         groups = summarise(features, weights, components, mixture.num_components)
@@ -134,7 +132,6 @@ class Prune(AbstractMove):
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:
         """Set the weights of improbable components to zero, unless y_t is missing."""
-        del key
         if is_missing(now):
             return mixture
         masses = mixture.log_mixture_weights

@@ -53,7 +53,6 @@ class Split(AbstractRegrouping, ByFeatures):
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The lighter half of every component that is too diffuse, to a free label."""
-        del key
         # Computed outside the condition, where XLA shares them with neighbouring moves.
         features, active = self.features_of(mixture), mixture.active
         parent = mixture.component_indicators

@@ -97,7 +97,6 @@ class Resample(AbstractResampling):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for fewer slots than each component is to have."""
-        del now
         each = self.particles_per_component or 1
         if each * num_components > num_particles:
             raise ValueError(
@@ -107,14 +106,12 @@ class Resample(AbstractResampling):
 
     def around(self, reference: Any) -> "Resample":
         """The move itself, which finds the slot of the one that is kept in the memory."""
-        del reference
         return self
 
     def would_resample(
         self, mixture: ParticleMixture, now: Step | None = None
     ) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
-        del now
         due = mixture.active
         if self.ess_threshold < 1.0:
             counts = mixture.component_counts

@@ -105,7 +105,6 @@ class Start(AbstractWrapper):
 
     def around(self, reference: Any) -> AbstractMove:
         """Raise a `ValueError`: no trajectory can be kept where all of it moves."""
-        del reference
         raise ValueError("filter: a start by the first observations cannot keep a trajectory")
 
     def would_resample(self, mixture: ParticleMixture, now: Step) -> Array:
