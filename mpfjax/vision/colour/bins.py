@@ -41,7 +41,10 @@ class RGBColours(AbstractColours):
 
     num_bins: Count = eqx.field(static=True, default=30)
 
-    num_channels = 3
+    @property
+    def num_channels(self) -> int:
+        """3."""
+        return 3
 
     def bins(self, frame: UInt8[Any, "h w 3"]) -> Int[Any, "h w 3"]:
         """Red, green and blue in steps of 256 / num_bins."""
@@ -66,7 +69,10 @@ class HSVColours(AbstractColours):
     least_saturation: Share = eqx.field(static=True, default=0.1)
     least_value: Share = eqx.field(static=True, default=0.2)
 
-    num_channels = 1
+    @property
+    def num_channels(self) -> int:
+        """1."""
+        return 1
 
     @property
     def num_bins(self) -> int:
