@@ -133,6 +133,7 @@ class Filter(eqx.Module):
         particles = drawn_once(keys[0], self._sample_initial)
         return raise_faults(*_start(self, keys, observation, inputs, particles))
 
+    @checked
     def step(
         self,
         key: Key[Array, ""],
@@ -150,6 +151,7 @@ class Filter(eqx.Module):
         """
         return self._run(key, mixture, one_observation(observation), inputs)
 
+    @checked
     def predict(
         self, key: Key[Array, ""], mixture: ParticleMixture, *, inputs: PyTree = None
     ) -> tuple[ParticleMixture, StepInfo]:
@@ -159,7 +161,6 @@ class Filter(eqx.Module):
         """
         return self._run(key, mixture, None, inputs)
 
-    @checked
     def _run(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree, inputs: PyTree
     ) -> tuple[ParticleMixture, StepInfo]:

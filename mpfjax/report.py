@@ -12,34 +12,39 @@ from mpfjax.operations.islands import num_islands
 
 
 class StepInfo(eqx.Module):
-    """The report of a step, which comes with its mixture."""
+    """The report of a step, which comes with its mixture.
+
+    - `log_likelihood_increment`: log p(y_t | y_1..y_{t-1}), estimated; -inf where every particle
+      has zero likelihood.
+    - `effective_sample_sizes`: of each component of the new mixture, zero for a dead one.
+    - `effective_sample_size`: 1 / Σ W², of the joint weights W of all particles.
+    - `mixture_weights`: the mass of each component of the new mixture.
+    - `resampled`: which components of the mixture that the step was given were resampled.
+    - `degenerate`: whether every particle had zero likelihood: the weights are then those of the
+      prediction.
+    - `labels_ran_out`: whether all M > 1 labels are in use, so that more modes share one; see
+      `Split.is_diffuse`.
+    - `log_marginal_likelihood_error`: the standard error of log Ẑ of all steps so far, from this
+      one run; None unless the filter is one of `mpfjax.smoothing.with_first_ancestors`.
+    - `mixture_weight_errors`: the standard error of each mixture weight; None likewise.
+    - `log_evidence_against_start`: log of p(y_t | x_{t-1} ~ p_0) over p(y_t | y_1..y_{t-1}): how
+      much y_t speaks for a state that begins anew, against all that the filter knows; None unless a
+      move tells it, as in `with_alarm` and `with_restarts`.
+    - `surprised`: whether all hypotheses seem wrong: the cumulative sum of that evidence is above
+      5, see `FilterRun.surprised`; None likewise.
+    """
 
     log_likelihood_increment: Float[Array, ""]
-    """log p(y_t | y_1..y_{t-1}), estimated; -inf where every particle has zero likelihood."""
     effective_sample_sizes: Float[Array, " m"]
-    """of each component of the new mixture, zero for a dead one."""
     effective_sample_size: Float[Array, ""]
-    """1 / Σ exp 2ℓ, of the whole new mixture."""
     mixture_weights: Float[Array, " m"]
-    """the mass of each component of the new mixture."""
     resampled: Bool[Array, " m"]
-    """which components of the mixture that the step was given were resampled."""
     degenerate: Bool[Array, ""]
-    """whether every particle had zero likelihood: the weights are then those of the prediction."""
     labels_ran_out: Bool[Array, ""]
-    """whether all M > 1 labels are in use, so that more modes share one; see `Split.is_diffuse`."""
     log_marginal_likelihood_error: Float[Array, ""] | None = None
-    """the standard error of log Ẑ of all steps so far, from this one run; None unless the filter
-    is one of `mpfjax.smoothing.with_first_ancestors`."""
     mixture_weight_errors: Float[Array, " m"] | None = None
-    """the standard error of each mixture weight; None likewise."""
     log_evidence_against_start: Float[Array, ""] | None = None
-    """log of p(y_t | x_{t-1} ~ p_0) over p(y_t | y_1..y_{t-1}): how much y_t speaks for a state
-    that begins anew, against all that the filter knows; None unless a move tells it, as in
-    `with_alarm` and `with_restarts`."""
     surprised: Bool[Array, ""] | None = None
-    """whether all hypotheses seem wrong: the cumulative sum of that evidence is above 5, see
-    `FilterRun.surprised`; None likewise."""
 
 
 def report_of(

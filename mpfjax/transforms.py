@@ -152,7 +152,7 @@ def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
 
 @checked
 def with_start(filter: Filter, num_observations: Count = 8) -> Filter:
-    """The filter that begins by a tempered sampler on its first L observations: `Start`.
+    """The filter that begins by a tempered sampler on its first L observations.
 
     In these steps it costs as much as 300 others where the prior is wide, and little where it is
     not; Ẑ stays unbiased, and derivatives in these steps are the score. It takes the place of a
@@ -188,14 +188,21 @@ def with_restarts(
     share: InnerShare = 1 / 4,
     num_draws: Count = 4,
 ) -> Filter:
-    """The filter that finds a state again which begins anew with a small probability: `Restart`.
+    """The filter that finds a state again which begins anew with a small probability.
 
     At each step x_{t-1} ~ (1 - p) δ + p p_0, and Ẑ is unbiased for this kernel. Draws of x_0 have a
     component of their own, one more than the filter has, which its regrouping leaves alone. They
     are an alarm as well, in the place of that of `with_alarm`. Of a filter with restarts it changes
-    the settings. Raises `ValueError` for a filter that does not resample all components at each
-    step by a `Resample`. Use it where a hypothesis may be wrong for good: a robot that is carried
-    away, a lost target.
+    the settings.
+
+    - `probability`: p, that of beginning anew in one step.
+    - `share`: the most of the particles that are draws of x_0, in steps where y_t speaks against
+      all others; elsewhere a sixteenth of it are.
+    - `num_draws`: among how many draws of x_0 y_t chooses each of them.
+
+    Raises `ValueError` for a filter that does not resample all components at each step by a
+    `Resample`. Use it where a hypothesis may be wrong for good: a robot that is carried away, a
+    lost target.
     """
     _require_resample(filter, "with which a state begins anew")
     settings = {"probability": probability, "share": share, "num_draws": num_draws}
@@ -230,10 +237,10 @@ def _apart(move: Any) -> Any:
 def with_alarm(filter: Filter, num_draws: Count = 4096) -> Filter:
     """The filter that says when all its hypotheses seem wrong: `FilterRun.surprised`.
 
-    At each step the increment is compared with the evidence for a state that begins anew: draws of
-    x_0, the same at each step, which cost as much as so many particles of a plain filter. A filter
-    of `with_restarts` has the same evidence from its own draws, and stays as it is. Use it where a
-    lost target must be noticed.
+    At each step the increment is compared with the evidence for a state that begins anew:
+    `num_draws` draws of x_0, the same at each step, which cost as much as so many particles. A
+    filter of `with_restarts` has the same evidence from its own draws, and stays as it is. Use it
+    where a lost target must be noticed.
     """
     if _has(filter, Restart):
         return filter

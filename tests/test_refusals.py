@@ -433,7 +433,7 @@ REFUSED = (
      lambda: Filter(changed(Drift, sample_transition=lambda self, key, x: x),
                     [Propagate(noise="rqmc")], 4)),
     *(
-        (f"{kind.__name__} holds no model; the filter gives it its own",
+        (f"a model, and {kind.__name__} holds none; the filter has its own",
          lambda kind=kind: kind(MODEL))
         for kind in (Propagate, Reweight, mpfjax.PropagateMarginalised, mpfjax.PropagateTempered,
                      mpfjax.RandomWalkMetropolis, mpfjax.Partitioned, mpfjax.GaussNewtonProposal,
@@ -518,6 +518,9 @@ MISTAKEN = (
      lambda: mpfjax.mixture_particle_filter(MODEL, 20, 2, allocation="equal")),
     ("mixture_particle_filter: max_components is missing",
      lambda: mpfjax.mixture_particle_filter(MODEL, 20)),
+    ("Filter.step: input is none of .*; did you mean inputs",
+     lambda: FILTER.step(KEY, FILTER.init(KEY), 1.0, input=2.0)),
+    ("Filter.predict: key is missing", lambda: FILTER.predict(FILTER.init(KEY))),
     ("Resample: ess_treshold is none of .*; did you mean ess_thr",
      lambda: Resample(ess_treshold=0.5)),
     ("Filter: num_component is none of .*; did you mean num_components",

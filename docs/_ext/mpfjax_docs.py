@@ -34,7 +34,10 @@ def target_of(code: str) -> str | None:
     if owner in names and member and not member.startswith("_"):
         holder = names[owner]
         module, _, attribute = holder.rpartition(".")
-        if member in vars(getattr(importlib.import_module(module), attribute)):
+        kind = getattr(importlib.import_module(module), attribute)
+        if member in getattr(kind, "__dataclass_fields__", ()):
+            return holder  # in whose text fields are
+        if member in vars(kind):
             return f"{holder}.{member}"
     return None
 

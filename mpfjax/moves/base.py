@@ -39,7 +39,7 @@ class Given(Checked):
         for name in self.__dataclass_fields__:
             if isinstance(getattr(self, name), AbstractStateSpaceModel):
                 who = type(self).__name__
-                raise ValueError(f"{name}: {who} holds no model; the filter gives it its own")
+                raise ValueError(f"{name}: a model, and {who} holds none; the filter has its own")
         super().__check_init__()
 
 

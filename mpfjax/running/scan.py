@@ -23,27 +23,33 @@ from mpfjax.report import StepInfo
 
 
 class FilterRun(eqx.Module):
-    """The result of running a filter over observations y_1..y_t."""
+    """The result of running a filter over observations y_1..y_t.
+
+    - `log_marginal_likelihood`: log p(y_1..y_t), estimated: the sum of the increments.
+    - `log_likelihood_increments`: of each step, -inf where every particle had zero likelihood.
+    - `collected`: what `collect` made of each step's mixture, stacked over t.
+    - `initial`: the mixture of x_0, before any observation.
+    - `final`: the mixture after the last step.
+    - `resampled`: which components each step resampled.
+    - `degenerate`: the steps at which every particle had zero likelihood.
+    - `effective_sample_size`: 1 / Σ W², of the joint weights W of all particles after each step.
+    - `log_evidence_against_start`: that of each step's `StepInfo`, and None unless a move of the
+      filter tells it.
+    - `surprised`: the steps at which all hypotheses seem wrong: the cumulative sum of that
+      evidence, which never falls below zero nor rises above 10, is above 5 (a CUSUM, Page 1954);
+      None likewise.
+    """
 
     log_marginal_likelihood: Float[Array, ""]
-    """log p(y_1..y_t), estimated: the sum of the increments."""
     log_likelihood_increments: Float[Array, " t"]
     collected: PyTree
-    """what `collect` made of each step's mixture, stacked over t."""
     initial: ParticleMixture
-    """the mixture of x_0, before any observation."""
     final: ParticleMixture
     resampled: Bool[Array, "t m"]
-    """which components each step resampled."""
     degenerate: Bool[Array, " t"]
-    """the steps at which every particle had zero likelihood."""
     effective_sample_size: Float[Array, " t"]
-    """(Σ W)² / Σ W² of the weights W of all particles after each step."""
     log_evidence_against_start: Float[Array, " t"] | None = None
-    """that of each step's `StepInfo`, and None unless a move of the filter tells it."""
     surprised: Bool[Array, " t"] | None = None
-    """the steps at which all hypotheses seem wrong: the cumulative sum of that evidence, which
-    never falls below zero nor rises above 10, is above 5 (a CUSUM, Page 1954); None likewise."""
 
 
 def scan(

@@ -214,6 +214,7 @@ class FixedLagSmoother(Checked):
         """The window to start from: at the mixture of `Filter.init`, or at any later one."""
         return Window(mixture, self._no_terms(mixture.particles), jnp.zeros((), jnp.int32))
 
+    @checked
     def step(
         self,
         key: Key[Array, ""],

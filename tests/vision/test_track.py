@@ -312,7 +312,12 @@ def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_
 @pytest.mark.exactness
 def test_drawn_boxes_give_one_track_each_in_the_order_given():
     first = walks()[walks()[:, 0] == 1][:, 2:6]
-    run = list(follow_boxes(stills()[:3], first[::-1]))
+    frames = [*stills()[:4]]
+    frames[1] = None  # it cannot be decoded
+    run = list(follow_boxes(frames, first[::-1]))
+    assert len(run) == len(frames)
+    with pytest.raises(ValueError, match="frames: the first, in which the boxes are, is None"):
+        next(follow_boxes([None], first))
     for number, tracks in enumerate(run, 1):
         rows = online_rows(number, tracks)
         assert rows[:, 1].tolist() == [1, 2]

@@ -22,6 +22,8 @@ from mpfjax.vision.files import drawing
 from mpfjax.vision.files.frames import of_one_kind
 from mpfjax.vision.tracking.state import Tracks
 
+_END = object()
+
 
 class Snapshot(NamedTuple):
     """The state of several runs in one frame; for a single run, without the leading axis.
@@ -140,7 +142,7 @@ def annotate(
 
 @checked
 def follow_boxes(
-    frames: Iterable[UInt8[np.ndarray, "..."]],
+    frames: Iterable[UInt8[np.ndarray, "..."] | None],
     boxes: Float[np.ndarray, "k 4"],
     *,
     key: Key[Array, ""] | None = None,
@@ -152,7 +154,8 @@ def follow_boxes(
     any component left has the identity 0. There are no detections: `confirmed` says whether the
     object has a component, and `unseen` is 0.
 
-    - `frames`: as for `track`; the boxes, top-left corner first, in pixels, lie in the first.
+    - `frames`: as for `track`; the boxes, top-left corner first, in pixels, lie in the first. One
+      that is None is predicted.
     - `key`: of the random numbers; None takes `jax.random.key(0)`.
 
     Raises `ValueError` for no boxes, for boxes without area or outside the first frame, and for
@@ -160,9 +163,11 @@ def follow_boxes(
     them.
     """
     stills = of_one_kind(frames)
-    first = next(stills, None)
-    if first is None:
+    first: Any = next(stills, _END)
+    if first is _END:
         return
+    if first is None:
+        raise ValueError("frames: the first, in which the boxes are, is None")
     boxes, key = to_rows(4, "boxes", boxes), jax.random.key(0) if key is None else key
     filter = objects_filters(first, boxes)["mpf"]
     model: Any = filter.model
@@ -174,7 +179,7 @@ def follow_boxes(
     advance = jit_with(little, _advance_boxes)
     for t, still in enumerate(itertools.chain([first], stills)):
         # An array: each new Python number would compile anew.
-        counted = count(model, still, soon=True)
+        counted = None if still is None else count(model, still, soon=True)
         mixture, tracks, faults = advance(filter, len(boxes), key, np.asarray(t), mixture, counted)
         yield jax.device_get(raise_faults(tracks, faults))
 
