@@ -213,7 +213,6 @@ class Filter(eqx.Module):
     ) -> tuple[ParticleMixture, StepInfo]:
         """A step; without an observation it only predicts."""
         now, mixture = self._now(observation), mixture.with_own_ancestors()
-        mixture = mixture.replace(periods=None)
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
         for move_key, move in zip(split(key, len(self.moves)), self.moves, strict=True):
@@ -226,11 +225,10 @@ class Filter(eqx.Module):
                     moved, log_growth = moved.normalised(mixture)
                     increment += log_growth
             mixture = moved
-        mixture = mixture.replace(parents=None, in_order=False)
+        mixture = mixture.replace(parents=None, in_order=False, periods=self._periods)
         evidence = None
         if SURPRISE in mixture.memory:
             mixture, evidence = hearing(self.moves, mixture, now, increment)
-        mixture = mixture.replace(periods=self._periods)
         return mixture, report_of(mixture, increment, resampled, evidence)
 
     def _step_and_faults(

@@ -384,11 +384,11 @@ class ParticleMixture(eqx.Module):
         return own.replace(**slots, log_scale=log_scale, usable_slots=first + number)
 
     def with_own_ancestors(self) -> "ParticleMixture":
-        """The mixture whose particles are their own ancestors, as before a step."""
+        """The mixture whose particles are their own ancestors, as a step begins with it."""
         own = jnp.arange(self.num_particles, dtype=jnp.int32)
         if num_islands() > 1:
             own += self.num_particles * island_index()
-        return self.replace(ancestor_indices=own)
+        return self.replace(ancestor_indices=own, periods=None)
 
     def with_parents(self) -> "ParticleMixture":
         """The mixture that keeps x_{t-1}, before a propagation; as it is if it keeps it already."""
