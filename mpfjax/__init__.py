@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from mpfjax.filter import Filter as Filter
 from mpfjax.filters import auxiliary_particle_filter as auxiliary_particle_filter
+from mpfjax.filters import bernoulli_filter as bernoulli_filter
 from mpfjax.filters import clustered_particle_filter as clustered_particle_filter
 from mpfjax.filters import distributed_partitioned_sampling as distributed_partitioned_sampling
 from mpfjax.filters import gaussian_mixture_particle_filter as gaussian_mixture_particle_filter
@@ -16,6 +17,11 @@ from mpfjax.filters import partitioned_sampling as partitioned_sampling
 from mpfjax.mixture import ParticleMixture as ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel as AbstractStateSpaceModel
 from mpfjax.models.base import per_particle as per_particle
+from mpfjax.models.births import AbstractBirth as AbstractBirth
+from mpfjax.models.births import Box as Box
+from mpfjax.models.births import Disc as Disc
+from mpfjax.models.births import GaussianBirth as GaussianBirth
+from mpfjax.models.births import UniformBirth as UniformBirth
 from mpfjax.models.clutter import ClutteredModel as ClutteredModel
 from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel as AbstractConditionallyLinearModel,
@@ -30,6 +36,7 @@ from mpfjax.models.multi_object import MultiObjectModel as MultiObjectModel
 from mpfjax.models.multi_object import PairwiseRepulsion as PairwiseRepulsion
 from mpfjax.models.observations import Series as Series
 from mpfjax.models.quadratic import QuadraticModel as QuadraticModel
+from mpfjax.models.targets import TargetsModel as TargetsModel
 from mpfjax.models.trial import check_model as check_model
 from mpfjax.models.trial import simulate as simulate
 from mpfjax.moves.base import AbstractMarkovMove as AbstractMarkovMove
@@ -43,7 +50,12 @@ from mpfjax.moves.every import Every as Every
 from mpfjax.moves.initial import SelectInitial as SelectInitial
 from mpfjax.moves.metropolis import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
 from mpfjax.moves.metropolis import RandomWalkMetropolis as RandomWalkMetropolis
+from mpfjax.moves.objects.bernoulli import Associate as Associate
 from mpfjax.moves.objects.partitioned import Partitioned as Partitioned
+from mpfjax.moves.objects.tracks import Targets as Targets
+from mpfjax.moves.objects.tracks import number_distribution as number_distribution
+from mpfjax.moves.objects.tracks import targets as targets
+from mpfjax.moves.objects.tracks import track_table as track_table
 from mpfjax.moves.propagation.nested import PropagateNested as PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate as Propagate
 from mpfjax.moves.propagation.propagate import PropagateMarginalised as PropagateMarginalised

@@ -14,8 +14,10 @@ from mpfjax.models.base import AbstractStateSpaceModel, mapped
 from mpfjax.models.conditionally_linear import is_marginalised, refuse_marginalised
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.models.noise import Noise
-from mpfjax.moves.base import AbstractMove, Gradient, as_moves
+from mpfjax.models.targets import TargetsModel
+from mpfjax.moves.base import AbstractMove, AbstractResampling, Gradient, as_moves
 from mpfjax.moves.every import Every
+from mpfjax.moves.objects.bernoulli import Associate
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, Reassembly
@@ -298,6 +300,37 @@ def clustered_particle_filter(
     """
     move = PropagateInClusters(start, split_after, scheme=scheme)
     return Filter(model, moves=[move], num_particles=num_particles)
+
+
+@checked
+def bernoulli_filter(
+    model: TargetsModel,
+    num_particles: Count,
+    max_targets: Count,
+    *,
+    proposal: AbstractProposal | None = None,
+    particles_per_birth: Count = 50,
+    undetected_particles: Count = 400,
+    resample: AbstractResampling | None = None,
+) -> Filter:
+    """An unknown number of objects that come and go: predict, associate.
+
+    A Poisson multi-Bernoulli filter (Williams 2015) in particles. Each of `max_targets` components
+    is an object that exists with some probability, and one more holds the intensity of those that
+    no measurement has revealed; `targets` tells them, and `Associate` how it works and what the
+    last three arguments are. All share `num_particles`: let there be a hundred or more for each
+    object, beside those undetected. Let `max_targets` be more than there are measurements in a scan
+    where objects may appear anywhere.
+
+    The default draws each object from its Gaussian, so that a few particles do. With `Resample()`
+    it has any shape, but all its particles descend from the `particles_per_birth` it began with, of
+    which there must then be many. Use it with a `TargetsModel`, where neither the number of objects
+    nor which measurement is whose is known; for one object a filter with `ClutteredModel`, for
+    boxes in a video `vision.ObjectTracker`.
+    """
+    resample = GaussianRegeneration() if resample is None else resample
+    associate = Associate(particles_per_birth, undetected_particles, resample=resample)
+    return Filter(model, [Predict(proposal), associate], num_particles, max_targets + 1)
 
 
 def _seen(

@@ -31,6 +31,12 @@ class Bug(NamedTuple):
 
 
 BUGS = {
+    "an object that was missed stays as probable": Bug(
+        "moves/objects/bernoulli.py",
+        "masses = seen + unseen * before.of_owners(1 / rows, 1)",
+        "masses = seen + unseen",
+        "tests/moves/test_bernoulli.py -k sensors_in_turn",
+    ),
     "the proposal's density has the wrong sign": Bug(
         "moves/propagation/propagate.py",
         "log_factors.append(log_transition(now.model, draws, previous) - log_density)",

@@ -81,6 +81,11 @@ FILTERED = {"key": KEY, "filter": FILTER, "observations": TWO}
 COLLECTED = FILTERED | {"collect": nothing}
 MANY = {"keys": KEY[None], "observations": TWO}
 GUIDE = mpfjax.GaussNewtonProposal()
+SENSOR = {"object_model": MODEL, "detection_probability": 0.9, "clutter_density": 0.1}
+BIRTH = {"rate": 1.0, "region": mpfjax.Box([0.0], [1.0]), "newborn": difference}
+TARGETS = {
+    "sensors": mpfjax.ClutteredModel(**SENSOR), "birth": mpfjax.UniformBirth(**BIRTH)
+}  # fmt: skip
 # The arguments of a good call that have no default, or whose default leaves something out.
 GOOD = {
     **alike({}, mpfjax.QuadraticModel, KMeans, mpfjax.Split, mpfjax.Prune, IslandInteraction,
@@ -110,8 +115,15 @@ GOOD = {
         "walk": mpfjax.RandomWalk([1.0]), "gain": 0.1, "initial_velocity": [0.5]},
     mpfjax.Autoregression: {"A1": EYE, "A2": EYE, "B": EYE, "mean": ZERO},
     mpfjax.MultiObjectModel: {"object_model": MODEL, "num_objects": 2},
-    mpfjax.ClutteredModel: {
-        "object_model": MODEL, "detection_probability": 0.9, "clutter_density": 0.1},
+    mpfjax.ClutteredModel: SENSOR,
+    mpfjax.TargetsModel: TARGETS,
+    mpfjax.UniformBirth: BIRTH,
+    mpfjax.GaussianBirth: {"rate": 1.0, "model": mpfjax.LinearGaussianModel(**LINEAR)},
+    mpfjax.Box: {"low": [0.0], "high": [1.0]},
+    mpfjax.Disc: {"centre": [0.0], "radius": 1.0},
+    mpfjax.Associate: {"particles_per_birth": 2},
+    mpfjax.bernoulli_filter: {
+        "model": mpfjax.TargetsModel(**TARGETS), "num_particles": 500, "max_targets": 2},
     mpfjax.per_particle: {"model": DriftOfOne()},
     mpfjax.AuxiliaryResample: {"resample": Resample(), "lookahead": GUIDE},
     mpfjax.Merge: {"max_distance": 2.0},
@@ -219,6 +231,7 @@ def test_every_public_call_is_tried():
         "FilterRun", "Step", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
         "NetworkProposal", "keep_programs", "check_model", "simulate", "map_moves",
+        "Targets", "targets", "track_table", "number_distribution",
     }  # fmt: skip
 
 

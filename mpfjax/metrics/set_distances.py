@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.checks import Positive, check_shape, checked, number, real_array
 
@@ -209,3 +209,32 @@ def _mask(name: str, mask: Any, size: int) -> Bool[Array, " k"]:
         return jnp.ones(size, bool)
     check_shape(f"{size}", **{name: mask})
     return jnp.asarray(mask, bool)
+
+
+@checked
+def track_switches(
+    estimates: Float[np.ndarray, "t m d"],
+    labels: Int[np.ndarray, "t m"],
+    truths: Float[np.ndarray, "t k d"],
+    *,
+    cutoff: Positive,
+) -> int:
+    """How often a true object is followed by a track of another label than before.
+
+    In each step estimates and true objects are paired at the least total distance, nearer than the
+    `cutoff`. Rows with a NaN are none. A track that is lost and found again under a new label
+    counts, too; a step without a pair does not. Raises `ValueError` for a cutoff that is not
+    positive and finite.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    last, switches = np.full(truths.shape[1], -1), 0
+    for here, names, there in zip(*map(np.asarray, (estimates, labels, truths)), strict=True):
+        gaps = np.linalg.norm(here[:, None] - there[None], axis=-1)
+        costs = np.where(gaps < cutoff, gaps, 2 * cutoff)  # where there is none it is NaN, not less
+        rows, columns = linear_sum_assignment(costs)
+        is_pair = costs[rows, columns] < cutoff
+        rows, columns = rows[is_pair], columns[is_pair]
+        switches += int(np.sum((last[columns] >= 0) & (last[columns] != names[rows])))
+        last[columns] = names[rows]
+    return switches

@@ -18,17 +18,19 @@ from mpfjax.models.base import (
 )
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.steps import own_likelihoods
-from mpfjax.operations.logarithms import log_or_nothing
+from mpfjax.operations.logarithms import default_float, log_or_nothing
+from mpfjax.operations.stored import on_platform
 
 # What the object's model has beside its three methods and its likelihood of one measurement.
-_PASSED_ON = (
+PASSED_ON = (
     "log_transition", "log_initial", "with_history", "initial_from_noise", "transition_from_noise",
     "initial_noise_dimension", "noise_dimension", "transition_mean", "transition_covariance",
     "periods",
 )  # fmt: skip
 
 
-def _number_or_function(name: str) -> Callable[[Any], Any]:
+def number_or_function(name: str) -> Callable[[Any], Any]:
+    """A converter of the argument of this name: numbers to an array, a function as it is."""
     numbers = to_array(name)
     return lambda value: value if callable(value) else numbers(value)
 
@@ -65,10 +67,10 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
     object_model: AbstractStateSpaceModel
     detection_probability: (
         Annotated[Float[Array, ""], SHARES] | Callable[[PyTree], Float[Array, " n"]]
-    ) = eqx.field(converter=_number_or_function("detection_probability"))
+    ) = eqx.field(converter=number_or_function("detection_probability"))
     clutter_density: (
         Annotated[Float[Array, ""], POSITIVE] | Callable[[PyTree], Float[Array, ""]]
-    ) = eqx.field(converter=_number_or_function("clutter_density"))
+    ) = eqx.field(converter=number_or_function("clutter_density"))
 
     handles_missing = True
 
@@ -91,39 +93,56 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """log L of the measurements, over that of clutter alone."""
-        there = _measured(observation)
+        odds, p = self.log_odds(observation, states), self.detection(states)
+        # Chances of 0 and 1 have no logarithm, but the likelihood has a derivative there.
+        largest = jax.lax.stop_gradient(jnp.maximum(jnp.max(odds, axis=1, initial=0.0), 0.0))
+        missed = (1 - p) * jnp.exp(-largest)
+        detected = p * jnp.sum(jnp.exp(odds - largest[:, None]), axis=1)
+        return largest + log_or_nothing(missed + detected)
 
-        def fill(leaf: Array) -> Array:
-            """A number that no logarithm turns into one that is not finite, nor its gradient."""
-            return jnp.where(jnp.isnan(leaf), jnp.ones_like(leaf), leaf)
+    def log_odds(self, observation: PyTree, states: PyTree) -> Float[Array, "n k"]:
+        """log N(y_j | x) / λ(y_j) of each state and each measurement, -inf for a row of none."""
+        density = self.clutter_density
 
-        def log_odds(measurement: PyTree) -> Float[Array, " n"]:
-            density = self.clutter_density
-            density = density(measurement) if callable(density) else density
+        def of_one(measurement: PyTree) -> Float[Array, " n"]:
+            false = density(measurement) if callable(density) else density
             values = own_likelihoods(self.object_model, measurement, states)
-            return values - jnp.log(density).astype(values.dtype)
+            return values - jnp.log(false).astype(values.dtype)
 
-        odds = jax.vmap(log_odds)(jax.tree.map(fill, observation))
+        # On a CPU, each fills the vectors by itself.
+        odds = on_platform(
+            filled(observation),
+            cpu=lambda rows: jax.lax.map(of_one, rows).T,
+            default=jax.vmap(of_one, out_axes=1),
+        )
+        return jnp.where(measured(observation)[None], odds, -jnp.inf)
+
+    def detection(self, states: PyTree) -> Float[Array, " n"]:
+        """p_D of each state."""
         p = self.detection_probability
         p = mapped(self.object_model, p)(states) if callable(p) else p
-        p = jnp.broadcast_to(p, odds.shape[1:]).astype(odds.dtype)
-        odds = jnp.where(there[:, None], odds, -jnp.inf)
-        # Chances of 0 and 1 have no logarithm, but the likelihood has a derivative there.
-        largest = jax.lax.stop_gradient(jnp.maximum(jnp.max(odds, axis=0, initial=0.0), 0.0))
-        missed = (1 - p) * jnp.exp(-largest)
-        detected = p * jnp.sum(jnp.exp(odds - largest[None]), axis=0)
-        return largest + log_or_nothing(missed + detected)
+        return jnp.broadcast_to(p, jax.tree.leaves(states)[0].shape[:1]).astype(default_float())
 
     def __getattr__(self, name: str) -> Any:
         # Only reached for names that the class lacks.
         model, is_of_noise = self.__dict__.get("object_model"), "noise" in name
         state = "initial" if name.startswith("initial") else "transition"
-        if name in _PASSED_ON and (not is_of_noise or is_made_of_noise(model, state)):
+        if name in PASSED_ON and (not is_of_noise or is_made_of_noise(model, state)):
             return getattr(model, name)
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
 
-def _measured(observation: PyTree) -> Bool[Array, " k"]:
+def measured(observation: PyTree) -> Bool[Array, " k"]:
     """Which rows are measurements: those without a NaN."""
     leaves = map(jnp.isnan, jax.tree.leaves(observation))
     return ~jnp.any(jnp.stack([leaf.any(tuple(range(1, leaf.ndim))) for leaf in leaves]), axis=0)
+
+
+def filled(observation: PyTree) -> PyTree:
+    """The rows with a number that no logarithm turns into one that is not finite in place of NaN.
+
+    Nor is its gradient.
+    """
+    return jax.tree.map(
+        lambda leaf: jnp.where(jnp.isnan(leaf), jnp.ones_like(leaf), leaf), observation
+    )

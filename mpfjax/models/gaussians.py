@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.operations.matrices import row_sums
+from mpfjax.operations.matrices import coordinates, total, transformed
 from mpfjax.operations.stored import stored
 
 # The least variance, in units of the rounding error of the numbers it was computed from.
@@ -141,7 +141,9 @@ def log_multinormal(
     identity = jnp.eye(len(factor), dtype=factor.dtype)
     whitening = jax.scipy.linalg.solve_triangular(factor, identity, lower=True)
     log_volume = jnp.sum(jnp.log(jnp.diagonal(factor)))
-    return row_sums(log_normal(residuals @ whitening.T, 1.0)) - log_volume
+    # Written out, it is one loop also where many observations are compared with many states.
+    whitened = transformed(whitening, coordinates(residuals), is_lower=True)
+    return total([log_normal(column, 1.0) for column in whitened]) - log_volume
 
 
 class Gaussian(NamedTuple):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.metrics import gospa, ospa
+from mpfjax.metrics import gospa, ospa, track_switches
 from tests.marking import exactness
 
 CUTOFF = 20.0
@@ -154,3 +154,13 @@ def test_the_gradient_is_finite_where_sets_coincide(metric, order):
     one_off = jax.grad(value)(truths.at[0, 0].add(0.5), truths)
     assert one_off[0, 0] > 0
     np.testing.assert_array_equal(one_off[1], 0.0)
+
+
+def test_switches_are_counted_where_an_object_has_another_label_than_before():
+    """Two objects at 0 and 10: a swap is two, a gap none, a new label after a gap one."""
+    nan = np.nan
+    estimates = np.array([[0, 10], [0, 10], [0, nan], [0, 10], [0, 40]], float)[..., None]
+    labels = np.array([[1, 2], [2, 1], [2, 1], [2, 3], [2, 9]])
+    truths = np.tile(np.array([0.0, 10.0])[:, None], (5, 1, 1))
+    assert track_switches(estimates, labels, truths, cutoff=5.0) == 3
+    assert track_switches(estimates, labels, truths[:, :1], cutoff=5.0) == 1

@@ -1,0 +1,147 @@
+"""Where new objects appear: how many in a step, and what they are like."""
+
+import abc
+import math
+from collections.abc import Callable
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import gammaln
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import FINITE, POSITIVE, Fitting, to_array
+from mpfjax.models.gaussians import Gaussian, Linear, cholesky, update
+from mpfjax.models.linear import LinearGaussianModel
+from mpfjax.operations.random import normal, split, uniform
+
+Rate = Annotated[Float[Array, ""], POSITIVE]
+
+
+class AbstractBirth(eqx.Module):
+    """The Poisson process of new objects in a step: `rate` of them, each with x ~ b.
+
+    A subclass has `rate`, a positive number, and `sample`. With `propose`, a new object's
+    particles start at a measurement; without it there must be enough draws of b near each, as
+    where objects appear at a few known spots.
+    """
+
+    rate: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def sample(self, key: Key[Array, ""], num_particles: int) -> PyTree:
+        """Draw states of new objects, x ~ b."""
+
+    def propose(
+        self, key: Key[Array, ""], measurement: PyTree, num_particles: int, sensor: int = 0
+    ) -> tuple[PyTree, Float[Array, " n"]] | None:
+        """States of new objects that a sensor's measurement may come from, and log b(x) / q(x)."""
+        return None
+
+
+class GaussianBirth(AbstractBirth, Fitting):
+    """New objects with the x_0 ~ N(m0, P0) of a linear model; at a measurement, x_0 given it.
+
+    Raises `ValueError` for a rate that is not positive. Use it with a wide P0 where objects may
+    appear anywhere.
+    """
+
+    rate: Rate = eqx.field(converter=to_array("rate"))
+    model: LinearGaussianModel
+
+    def sample(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
+        """x_0."""
+        return self.model.sample_initial(key, num_particles)
+
+    def propose(
+        self,
+        key: Key[Array, ""],
+        measurement: Float[Array, " p"],
+        num_particles: int,
+        sensor: int = 0,
+    ) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
+        """x_0 given the measurement, and log of its density over that of x_0 given it."""
+        m = self.model
+        prior = Gaussian(m.m0[:, None], m.P0[:, :, None])
+        seen = Linear(m.H[:, :, None], jnp.zeros((len(m.R), 1)), m.R[:, :, None])
+        found, log_predicted = update(prior, measurement[:, None], seen)
+        root = cholesky(found.covariance)[:, :, 0]
+        noise = normal(key, (num_particles, len(m.m0)), m.m0.dtype)
+        states = found.mean.T + noise @ root.T
+        return states, log_predicted - m.log_likelihood(measurement, states)
+
+
+class Box(Fitting):
+    """Places between two corners, in any number of dimensions."""
+
+    low: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("low"))
+    high: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("high"))
+
+    def sample(self, key: Key[Array, ""], num_places: int) -> Float[Array, "n d"]:
+        """Draw places evenly."""
+        shares = uniform(key, (num_places, self.low.shape[0]), self.low.dtype)
+        return self.low[None] + shares * (self.high - self.low)[None]
+
+    def log_density(self, places: Float[Array, "n d"]) -> Float[Array, " n"]:
+        """log of one over the volume, -inf outside."""
+        inside = jnp.all((places >= self.low[None]) & (places <= self.high[None]), axis=1)
+        return jnp.where(inside, -jnp.sum(jnp.log(self.high - self.low)), -jnp.inf)
+
+
+class Disc(Fitting):
+    """Places around a centre: a disc in two dimensions, a ball in three."""
+
+    centre: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("centre"))
+    radius: Annotated[Float[Array, ""], POSITIVE] = eqx.field(converter=to_array("radius"))
+
+    def sample(self, key: Key[Array, ""], num_places: int) -> Float[Array, "n d"]:
+        """Draw places evenly."""
+        key_way, key_far = split(key, 2)
+        d, dtype = self.centre.shape[0], self.centre.dtype
+        ways = normal(key_way, (num_places, d), dtype)
+        far = self.radius * uniform(key_far, (num_places, 1), dtype) ** (1 / d)
+        return self.centre[None] + far * ways / jnp.linalg.norm(ways, axis=1, keepdims=True)
+
+    def log_density(self, places: Float[Array, "n d"]) -> Float[Array, " n"]:
+        """log of one over the volume, -inf outside."""
+        d = self.centre.shape[0]
+        inside = jnp.linalg.norm(places - self.centre[None], axis=1) <= self.radius
+        log_unit = 0.5 * d * math.log(math.pi) - gammaln(0.5 * d + 1.0)
+        return jnp.where(inside, -log_unit - d * jnp.log(self.radius), -jnp.inf)
+
+
+class UniformBirth(AbstractBirth, Fitting):
+    """New objects evenly in a region.
+
+    - `rate`: how many to expect in a step.
+    - `region`: a `Box` or a `Disc` of places.
+    - `newborn`: a function `(key, places) -> states` of new objects at these places, (n, d); it
+      draws the rest of the state, such as a speed.
+    - `locate`: a function `(key, measurement, n) -> (places, log_density)`, which draws places
+      that a measurement may come from, and has the log of their density, (n,); one for each
+      sensor where there are several. None where new objects are to come from `newborn` alone.
+
+    Raises `ValueError` for a rate that is not positive. Use it where objects enter unannounced.
+    """
+
+    rate: Rate = eqx.field(converter=to_array("rate"))
+    region: Box | Disc
+    newborn: Callable[[Key[Array, ""], Array], PyTree]
+    locate: Callable[..., tuple] | tuple[Callable[..., tuple] | None, ...] | None = None
+
+    def sample(self, key: Key[Array, ""], num_particles: int) -> PyTree:
+        """States in the region."""
+        key_place, key_rest = split(key, 2)
+        return self.newborn(key_rest, self.region.sample(key_place, num_particles))
+
+    def propose(
+        self, key: Key[Array, ""], measurement: PyTree, num_particles: int, sensor: int = 0
+    ) -> tuple[PyTree, Float[Array, " n"]] | None:
+        """States at places drawn by `locate`."""
+        locate = self.locate[sensor] if isinstance(self.locate, tuple) else self.locate
+        if locate is None:
+            return None
+        key_place, key_rest = jax.random.split(key)
+        places, log_density = locate(key_place, measurement, num_particles)
+        return self.newborn(key_rest, places), self.region.log_density(places) - log_density

@@ -1,0 +1,92 @@
+"""Objects that come and go, seen by sensors that miss some and report others that are not there."""
+
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import equinox as eqx
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import NOT_NEGATIVE, SHARES, Fitting, is_series, to_array
+from mpfjax.models.base import AbstractStateSpaceModel, mapped, replaced, with_inputs
+from mpfjax.models.births import AbstractBirth
+from mpfjax.models.clutter import PASSED_ON, ClutteredModel, number_or_function
+from mpfjax.operations.logarithms import default_float
+from mpfjax.operations.matrices import total
+
+
+def _as_sensors(sensors: Any) -> tuple[Any, ...]:
+    sensors = tuple(sensors) if is_series(sensors) else (sensors,)
+    for sensor in sensors:
+        if not isinstance(sensor, ClutteredModel):
+            raise ValueError(f"sensors: {sensor!r} is no ClutteredModel")
+    return sensors
+
+
+class TargetsModel(AbstractStateSpaceModel, Fitting):
+    """An unknown number of objects that appear, move, disappear, and are seen among clutter.
+
+    In a step each object survives with probability p_S(x_t), and moves by the object model; new
+    ones appear as a Poisson process. Each sensor then detects each object with probability p_D(x),
+    and reports one measurement of it, among clutter (the model of Mahler 2003, and of Williams
+    2015). A state is that of one object. `bernoulli_filter` keeps a component for each.
+
+    - `sensors`: a `ClutteredModel`, of one object's motion, one measurement of it, p_D and the
+      clutter; or several, used in turn, of which the first has the motion.
+    - `birth`: the new objects of a step, an `AbstractBirth`: `UniformBirth`, `GaussianBirth`.
+    - `survival_probability`: p_S, a number in [0, 1], or a function of the states, (n,).
+    - `initial_number`: how many objects to expect at t = 0, like new ones.
+
+    An observation is what `ClutteredModel` takes, K rows of which those with a NaN are none; with
+    several sensors a tuple of these. A scan without any says that every object was missed; one
+    with the sensor off is missing, see `Series`. log L(y_t | x) is that of x as the only object.
+    Raises `ValueError` for numbers outside of these and other sensors.
+    """
+
+    sensors: tuple[ClutteredModel, ...] = eqx.field(converter=_as_sensors)
+    birth: AbstractBirth
+    survival_probability: (
+        Annotated[Float[Array, ""], SHARES] | Callable[[PyTree], Float[Array, " n"]]
+    ) = eqx.field(converter=number_or_function("survival_probability"), default=0.99)
+    initial_number: Annotated[Float[Array, ""], NOT_NEGATIVE] = eqx.field(
+        converter=to_array("initial_number"), default=0.0
+    )
+
+    handles_missing = True
+
+    def with_inputs(self, inputs: PyTree) -> "TargetsModel":
+        """The model whose objects have u_t."""
+        return replaced(self, sensors=tuple(with_inputs(each, inputs) for each in self.sensors))
+
+    def scans(self, observation: PyTree) -> tuple[PyTree, ...]:
+        """The measurements of each sensor; a `ValueError` for another number of these."""
+        if len(self.sensors) == 1:
+            return (observation,)
+        if not isinstance(observation, tuple | list) or len(observation) != len(self.sensors):
+            each = f"a tuple of measurements for each of {len(self.sensors)} sensors"
+            raise ValueError(f"observation: it is not {each}")
+        return tuple(observation)
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
+        """States of new objects."""
+        return self.birth.sample(key, num_particles)
+
+    def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
+        """x_t of each object."""
+        return self.sensors[0].sample_transition(key, states)
+
+    def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
+        """log L of the measurements over that of clutter alone, with x as the only object."""
+        scans = zip(self.sensors, self.scans(observation), strict=True)
+        return total([sensor.log_likelihood(scan, states) for sensor, scan in scans])
+
+    def survival(self, states: PyTree) -> Float[Array, " #n"]:
+        """p_S of each state."""
+        p = self.survival_probability
+        p = mapped(self.sensors[0].object_model, p)(states) if callable(p) else p[None]
+        return p.astype(default_float())
+
+    def __getattr__(self, name: str) -> Any:
+        # Only reached for names that the class lacks.
+        if name in PASSED_ON and "initial" not in name:
+            return getattr(self.sensors[0], name)
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")

@@ -1,0 +1,310 @@
+"""Objects that come and go: a component for each, by the probabilities of all associations."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
+
+from mpfjax.checks import Count, Share, check
+from mpfjax.mixture import ParticleMixture, no_ancestors
+from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.clutter import filled, measured
+from mpfjax.models.targets import TargetsModel
+from mpfjax.moves.base import AbstractResampling, AbstractWrapper, Step
+from mpfjax.moves.objects.association import associate
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.operations.islands import num_islands
+from mpfjax.operations.logarithms import add_gradient, exp, log_or_nothing
+from mpfjax.operations.random import split, uniform
+from mpfjax.operations.stored import take
+
+TARGETS = "targets"
+
+
+class _Intensity(NamedTuple):
+    """How many objects to expect at each particle, as a step goes on.
+
+    The first `num_undetected` particles are of objects that no measurement has revealed. The
+    others are of objects that may exist, each in an `owners` of its own.
+    """
+
+    states: PyTree
+    masses: Float[Array, " p"]
+    owners: Int[Array, " q"]
+    num_undetected: int
+    num_objects: int
+    log_evidence: Float[Array, ""]
+
+    def sums(self, values: Float[Array, "p *k"]) -> Float[Array, "m *k"]:
+        """Over each object's particles."""
+        return jax.ops.segment_sum(values[self.num_undetected :], self.owners, self.num_objects)
+
+    def of_owners(
+        self, objects: Shaped[Array, "m *k"], undetected: float = 0
+    ) -> Shaped[Array, "p *k"]:
+        """What belongs to each particle's object, or to those that are not detected."""
+        first = jnp.full((self.num_undetected, *objects.shape[1:]), undetected, objects.dtype)
+        return jnp.concatenate([first, take(objects, self.owners)])
+
+
+class Associate(AbstractWrapper):
+    """Weigh the objects by a scan's measurements, over all associations, and start new ones.
+
+    A Poisson multi-Bernoulli filter (Williams 2015) in particles, with the marginal probabilities
+    of associations by belief propagation (Williams and Lau 2014; Meyer et al. 2018). The joint
+    weights are the intensity of the objects, normalised: times the expected number, which the
+    memory holds, those of component m >= 1 sum to the probability r_m that its object exists, and
+    those of component 0 to the expected number of objects that no measurement has revealed yet.
+    After a `Predict`, with u the intensity at a particle, G_j its p_D N(y_j | x) / λ(y_j),
+
+    1. u is multiplied by p_S, and new objects join component 0.
+    2. Each measurement may be the first of an object, whose particles are drawn ∝ G_j u from
+       component 0, and from those that the birth proposes at the measurement.
+    3. Each u becomes u (1 - p_D) P(m has none) / P₀ + Σ_j u G_j P(m has j) / Σ_m u G_j, with the
+       probabilities of `associate`, and u (1 - p_D) in component 0.
+    4. The M most probable objects stay, the first in component 1. Others, and those below
+       `least_existence`, go to component 0 and are no longer told apart, so that none is lost
+       (Williams 2012).
+    5. Each component is resampled, by `resample`.
+
+    The mass grows by log p of the scan over that of clutter alone, as `ClutteredModel` has it, in
+    Bethe's approximation, which is exact where no two objects compete for two measurements. It is
+    the only approximation together with step 4 and with the product form after each scan
+    (`approximate`). Labels count objects up from 1; they are not identities once two objects have
+    been close, whoever computes them. `memory["targets"]` holds the number, the labels, and how
+    many objects were crowded out.
+
+    - `particles_per_birth`: the particles of a new object at each measurement.
+    - `undetected_particles`: those of component 0, which fill the first slots.
+    - `least_existence`: an object less probable than this has no component of its own.
+    - `resample`: how each object is drawn anew, with the particles that its weight earns.
+    - `resample_undetected`: the same for component 0.
+
+    Raises `ValueError` on islands, for `slots`, and without slots for the objects.
+    """
+
+    particles_per_birth: Count = eqx.field(static=True, default=50)
+    undetected_particles: Count = eqx.field(static=True, default=400)
+    least_existence: Share = eqx.field(static=True, default=1e-4)
+    resample: AbstractResampling = Resample()
+    resample_undetected: AbstractResampling = Resample()
+
+    holds = ("resample", "resample_undetected")
+    approximate = True
+    weighs = True
+    keeps_mass = False
+    keeps_parents = False
+    keeps_families = False
+
+    def initial_memory(
+        self, model: AbstractStateSpaceModel, num_components: int
+    ) -> dict[str, PyTree]:
+        """The expected number, and the labels of all components, 0 of one without an object."""
+        memory = {
+            "number": getattr(model, "initial_number", jnp.zeros(())),
+            "labels": jnp.zeros(num_components, jnp.int32),
+            "next_label": jnp.ones((), jnp.int32),
+            "crowded_out": jnp.zeros(()),
+        }
+        return {TARGETS: memory} | super().initial_memory(model, num_components)
+
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a model of another kind, and where objects have no room."""
+        check(TargetsModel, model=now.model)
+        if num_components < 2:
+            raise ValueError("num_components: 1 is that of objects not detected; it has no other")
+        size, least = self.undetected_particles, self.undetected_particles + num_components - 1
+        if num_particles < least:
+            which = f"is less than {least}, {size} undetected_particles and one for each object"
+            raise ValueError(f"num_particles: {num_particles} {which}")
+        self.resample_undetected.check(now, size, 1)
+        self.resample.check(now, num_particles - size, num_components - 1)
+
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
+        """Weigh by each sensor's measurements in turn, then resample."""
+        if mixture.usable_slots is not None or num_islands() > 1:
+            raise ValueError("slots: Associate fills every slot, and is not for islands")
+        model: Any = now.model
+        scans = () if now.observation is None else model.scans(now.observation)
+        key_new, key_last, *keys = split(key, 2 + len(scans))
+        intensity = self._predicted(key_new, mixture, model)
+        for number, (key_scan, scan) in enumerate(zip(keys, scans, strict=True)):
+            intensity = self._updated(key_scan, intensity, model, scan, number)
+        return self._resampled(key_last, mixture, intensity)
+
+    def _predicted(
+        self, key: Key[Array, ""], mixture: ParticleMixture, model: TargetsModel
+    ) -> _Intensity:
+        """The intensity before the scan: of survivors and new objects."""
+        size, number = self.undetected_particles, mixture.memory[TARGETS]["number"]
+        weights = mixture.weights * model.survival(mixture.particles)
+        is_undetected = mixture.component_indicators == 0
+        # In the first step these fill all slots, of which the first ones stand for all.
+        first = jnp.where(is_undetected, weights, 0.0)
+        share = jnp.sum(first) / jnp.maximum(jnp.sum(first[:size]), jnp.finfo(first.dtype).tiny)
+        rest = jnp.where(is_undetected, 0.0, weights)[size:]
+        rate = jnp.broadcast_to(model.birth.rate / size, (size,))
+
+        def joined(old: Array, new: Array) -> Array:
+            return jnp.concatenate([old[:size], new.astype(old.dtype), old[size:]])
+
+        return _Intensity(
+            jax.tree.map(joined, mixture.particles, model.birth.sample(key, size)),
+            jnp.concatenate([number * share * first[:size], rate, number * rest]),
+            jnp.maximum(mixture.component_indicators[size:] - 1, 0),
+            2 * size,
+            mixture.num_components - 1,
+            jnp.zeros_like(mixture.log_scale),
+        )
+
+    def _updated(
+        self,
+        key: Key[Array, ""],
+        before: _Intensity,
+        model: TargetsModel,
+        scan: PyTree,
+        number: int,
+    ) -> _Intensity:
+        """The intensity given the measurements of one sensor."""
+        key_born, key_drawn = split(key, 2)
+        sensor, first = model.sensors[number], before.num_undetected
+        log_odds, detection = sensor.log_odds(scan, before.states), sensor.detection(before.states)
+        born, log_born = self._born(key_born, model, scan, number)
+        highest = jnp.maximum(jnp.max(log_odds, axis=0), jnp.max(log_born, axis=1, initial=0.0))
+        units = jax.lax.stop_gradient(jnp.maximum(highest, 0.0))
+        likely = (before.masses * detection)[:, None] * exp(log_odds - units[None])
+        detectable = likely[: first // 2] if born else likely[:first]
+        starts = jnp.concatenate([detectable.T, exp(log_born - units[:, None])], axis=1)
+
+        pairs, unseen = before.sums(likely), before.masses * (1 - detection)
+        missed = before.sums(unseen) + jnp.maximum(1 - before.sums(before.masses), 0.0)
+        totals = jnp.sum(starts, axis=1)
+        association = associate(pairs, missed, jnp.exp(-units) + totals)
+        rows = association.row_sums
+        replies = before.of_owners(association.replies / rows[:, None])
+        seen = jnp.sum(likely * replies, axis=1)
+        masses = seen + unseen * before.of_owners(1 / rows, 1)
+        log_evidence = association.log_total + jnp.sum(units)
+        log_evidence -= jnp.sum((before.masses * detection)[:first])
+
+        # New objects: particles drawn with equal shares of the probability.
+        size, num_rows = self.particles_per_birth, len(totals)
+        drawn = _drawn_in_rows(key_drawn, starts, size)
+        chosen = jnp.take_along_axis(starts, drawn, axis=1)
+        equal = jax.lax.stop_gradient(jnp.broadcast_to(totals[:, None], drawn.shape))
+        ratios = chosen / jax.lax.stop_gradient(jnp.where(chosen > 0, chosen, 1.0))
+        shares = add_gradient(equal, equal * ratios)  # of the one drawn, as `Resample` has it
+        new_masses = shares / association.column_sums[:, None] / size
+        places, own = jnp.arange(num_rows, dtype=jnp.int32)[:, None], detectable.shape[0]
+        offsets = len(masses) + places * size - own
+        drawn = jnp.where(drawn < own, drawn, drawn + offsets).reshape(-1)
+
+        def joined(old: Array, *born: Array) -> Array:
+            every = jnp.concatenate([old, *(leaf.reshape(-1, *old.shape[1:]) for leaf in born)])
+            return jnp.concatenate([old, take(every, drawn)])
+
+        new_owners = jnp.repeat(before.num_objects + places[:, 0], size)
+        return before._replace(
+            states=jax.tree.map(joined, before.states, *born),
+            masses=jnp.concatenate([masses, new_masses.reshape(-1)]),
+            owners=jnp.concatenate([before.owners, new_owners]),
+            num_objects=before.num_objects + num_rows,
+            log_evidence=before.log_evidence + log_evidence,
+        )
+
+    def _born(
+        self, key: Key[Array, ""], model: TargetsModel, scan: PyTree, number: int
+    ) -> tuple[tuple[PyTree, ...], Float[Array, "k b"]]:
+        """States proposed at each measurement, and log of the mass of each as that measurement's.
+
+        Over that of clutter. No states where nothing is proposed.
+        """
+        size, sensor, is_there = self.particles_per_birth, model.sensors[number], measured(scan)
+
+        def propose(key: Key[Array, ""], measurement: PyTree) -> tuple | None:
+            proposed = model.birth.propose(key, measurement, size, number)
+            if proposed is None:
+                return None
+            states, log_masses = proposed
+            one = jax.tree.map(lambda leaf: leaf[None], measurement)
+            log_masses += sensor.log_odds(one, states)[:, 0] + jnp.log(sensor.detection(states))
+            for earlier in model.sensors[:number]:
+                log_masses += jnp.log1p(-earlier.detection(states))
+            return states, log_masses
+
+        born = jax.vmap(propose)(split(key, is_there.shape[0]), filled(scan))
+        if born is None:
+            return (), jnp.zeros((is_there.shape[0], 0))
+        log_masses = born[1] + jnp.log(model.birth.rate / size)
+        return (born[0],), jnp.where(is_there[:, None], log_masses, -jnp.inf)
+
+    def _told_apart(
+        self, memory: dict[str, Array], intensity: _Intensity, most: int
+    ) -> tuple[Int[Array, " p"], dict[str, Array]]:
+        """The component of each particle: the most probable objects have one. And the memory."""
+        existence = jax.lax.stop_gradient(intensity.sums(intensity.masses))
+        order = jnp.argsort(-existence)
+        is_probable = existence[order] >= self.least_existence
+        ranks = jnp.arange(len(order), dtype=jnp.int32)
+        components = jnp.where(is_probable & (ranks < most), ranks + 1, 0)
+        of_each = intensity.of_owners(jnp.zeros_like(components).at[order].set(components))
+        stays = components[:most] > 0
+        labels = jnp.pad(memory["labels"][1:], (0, len(order) - most))[order][:most]
+        starts = stays & (labels == 0)
+        upto = jnp.cumsum(starts, dtype=jnp.int32)
+        labels = jnp.where(starts, memory["next_label"] + upto - 1, jnp.where(stays, labels, 0))
+        return of_each, {
+            "number": jnp.sum(intensity.masses),
+            "labels": jnp.pad(labels, (1, 0)),
+            "next_label": memory["next_label"] + upto[-1],
+            "crowded_out": jnp.sum(jnp.where(is_probable, existence[order], 0.0)[most:]),
+        }
+
+    def _resampled(
+        self, key: Key[Array, ""], mixture: ParticleMixture, intensity: _Intensity
+    ) -> ParticleMixture:
+        """The mixture's slots drawn from all particles, and the memory of the step."""
+        n, most, size = mixture.num_particles, mixture.num_components - 1, self.undetected_particles
+        of_each, memory = self._told_apart(mixture.memory[TARGETS], intensity, most)
+        log_weights = log_or_nothing(intensity.masses) - log_or_nothing(memory["number"])
+        key_first, key_rest = split(key, 2)
+
+        def drawn(
+            key: Key[Array, ""], move: AbstractResampling, is_of: Array, most: int, size: int
+        ) -> ParticleMixture:
+            wide = ParticleMixture(
+                particles=intensity.states,
+                log_weights=jnp.where(is_of, log_weights, -jnp.inf),
+                component_indicators=jnp.where(is_of, of_each, 0),
+                ancestor_indices=jnp.zeros_like(of_each),
+                num_components=most,
+                usable_slots=jnp.asarray(size, jnp.int32),
+            )
+            return move.resample(key, wide).map_slots(lambda leaf: leaf[:n])
+
+        undetected = drawn(key_first, self.resample_undetected, of_each == 0, 1, size)
+        objects = drawn(key_rest, self.resample, of_each > 0, most + 1, n - size)
+        every = undetected.joined(objects)
+        return mixture.replace(
+            particles=every.particles,
+            log_weights=every.log_weights,
+            component_indicators=every.component_indicators,
+            ancestor_indices=no_ancestors(mixture),
+            log_scale=mixture.log_scale + intensity.log_evidence,
+            memory=mixture.memory | {TARGETS: memory},
+        )
+
+
+def _drawn_in_rows(
+    key: Key[Array, ""], weights: Float[Array, "k n"], number: int
+) -> Int[Array, "k number"]:
+    """So many columns of each row in proportion to its weights, systematically."""
+    upto = jnp.cumsum(jax.lax.stop_gradient(weights), axis=1)
+    first = uniform(key, (len(upto), 1), upto.dtype)
+    shares = (jnp.arange(number, dtype=upto.dtype)[None] + first) / number
+    shares *= 1 - jnp.finfo(upto.dtype).eps  # the last one is below the total, and has weight
+    find = jax.vmap(lambda upto, points: jnp.searchsorted(upto, points, side="right"))
+    places = find(upto, shares * upto[:, -1:]).astype(jnp.int32)
+    return jnp.minimum(places, weights.shape[1] - 1)

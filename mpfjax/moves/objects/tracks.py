@@ -1,0 +1,108 @@
+"""What a filter of objects that come and go tells: tracks, and how many objects there are."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from mpfjax.checks import Share, checked, warn
+from mpfjax.mixture import ParticleMixture, flatten_states
+from mpfjax.moves.objects.bernoulli import TARGETS
+
+
+class Targets(NamedTuple):
+    """The objects of one step, an entry for each component that may hold one.
+
+    - `labels`: of each object, from 1 on, 0 where there is none.
+    - `existence`: the probability that it exists, zero where there is none.
+    - `means`, `covariances`: of its state; the state's own form, NaN where there is
+      none, and (M, d, d) of the flat one.
+    - `quantiles`: of each number of the flattened state, (M, q, d); None where none are asked for.
+    - `expected_number`: of all objects; `undetected` of them have not been revealed yet.
+    - `crowded_out`: how many objects to expect that found no component in this step.
+    """
+
+    labels: Int[Array, " m"]
+    existence: Float[Array, " m"]
+    means: PyTree
+    covariances: Float[Array, "m d d"]
+    quantiles: Float[Array, "m q d"] | None
+    expected_number: Float[Array, ""]
+    undetected: Float[Array, ""]
+    crowded_out: Float[Array, ""]
+
+
+def targets(mixture: ParticleMixture, q: Sequence[float] = ()) -> Targets:
+    """The objects of a `bernoulli_filter`, for `collect=targets` or one mixture.
+
+    - `q`: which quantiles to find, such as (0.05, 0.95). They cost a sort for each component.
+
+    Raises `ValueError` for a mixture of another filter. Use it with `number_distribution`, and with
+    `track_table` for a table of a whole run.
+    """
+    if TARGETS not in mixture.memory:
+        raise ValueError("mixture: it is of no bernoulli_filter")
+    memory, values = mixture.memory[TARGETS], flatten_states(mixture.particles)
+    existence = memory["number"] * mixture.mixture_weights
+
+    def of_component(m: Int[Array, ""]) -> Float[Array, "q d"]:
+        is_own = mixture.component_indicators == m
+        log_weights = jnp.where(is_own, mixture.log_weights, -jnp.inf)
+        log_weights -= mixture.log_mixture_weights[m]
+        return mixture.replace(log_weights=log_weights).quantile(values, q)
+
+    places = jnp.arange(1, mixture.num_components, dtype=jnp.int32)
+    means = jax.tree.map(lambda leaf: leaf[1:], mixture.component_means())
+    return Targets(
+        labels=memory["labels"][1:],
+        existence=jnp.minimum(existence[1:], 1.0),
+        means=means,
+        covariances=mixture.component_covariances()[1:],
+        quantiles=jax.vmap(of_component)(places) if len(q) else None,
+        expected_number=memory["number"],
+        undetected=existence[0],
+        crowded_out=memory["crowded_out"],
+    )
+
+
+def number_distribution(existence: Float[Array, " m"]) -> Float[Array, " n"]:
+    """P(0), ..., P(M) objects, of which each exists with its own probability.
+
+    The distribution of a sum of independent events, Poisson-binomial. Objects that no measurement
+    has revealed are a Poisson number more, of mean `undetected`.
+    """
+
+    def with_one_more(shares: Float[Array, " n"], r: Float[Array, ""]) -> tuple:
+        return (1 - r) * shares + r * jnp.roll(shares, 1).at[0].set(0.0), None
+
+    none = jnp.zeros(existence.shape[0] + 1, existence.dtype).at[0].set(1.0)
+    return jax.lax.scan(with_one_more, none, existence)[0]
+
+
+@checked
+def track_table(run: Targets, least_existence: Share = 0.5) -> dict[str, np.ndarray]:
+    """The tracks of a run as columns: `pandas.DataFrame(track_table(run.collected))`.
+
+    - `run`: what `run_filter(..., collect=targets)` collected, with a leading axis of steps.
+    - `least_existence`: a track is told in steps in which its object is at least this probable.
+
+    The columns are `step`, from 1 on, `label`, `existence`, and `mean_k` and `deviation_k` of each
+    number of the state. Warns where objects were crowded out, with the first such step.
+    """
+    lost = np.asarray(run.crowded_out)
+    if len(steps := np.flatnonzero(lost >= least_existence)):
+        at = f"at step {steps[0] + 1} for {lost[steps[0]]:.1f} objects"
+        warn(f"max_targets: there was no room {at}; they are not told apart")
+    existence, labels = np.asarray(run.existence), np.asarray(run.labels)
+    steps, places = np.nonzero((existence >= least_existence) & (labels > 0))
+    flat = jax.vmap(flatten_states)(run.means)
+    means = np.asarray(flat)[steps, places]
+    variances = np.diagonal(np.asarray(run.covariances), axis1=2, axis2=3)[steps, places]
+    told: dict[str, np.ndarray] = {"step": steps + 1, "label": labels[steps, places]}
+    told["existence"] = existence[steps, places]
+    for k in range(means.shape[1]):
+        told |= {f"mean_{k}": means[:, k], f"deviation_{k}": np.sqrt(variances[:, k])}
+    return told

@@ -1,0 +1,364 @@
+"""Objects that come and go, against the enumeration of all associations and Gaussian sums."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import mpfjax
+from mpfjax import ClutteredModel, Filter, GaussianBirth, TargetsModel
+from mpfjax.moves.objects.association import associate
+from mpfjax.moves.objects.bernoulli import TARGETS, Associate
+from mpfjax.moves.propagation.propagate import Predict
+from tests.models.test_clutter import SETS, by_associations
+from tests.unbiased import assert_unbiased
+
+KEY = jax.random.key(0)
+A, Q, R, P0, P_D, CLUTTER = 0.9, 0.5, 0.3, 1.0, 0.7, 0.2
+OBJECT = mpfjax.LinearGaussianModel([[A]], [[Q]], [[1.0]], [[R]], [0.0], [[P0]])
+SENSOR = ClutteredModel(OBJECT, P_D, CLUTTER)
+NAN = np.nan
+
+
+def enumerated(pairs, missed, alone):
+    """The probability of each pair, and log of the sum over all assignments."""
+    (m, k), total, shares = pairs.shape, 0.0, np.zeros(pairs.shape)
+    for choice in itertools.product(range(-1, k), repeat=m):
+        taken = [column for column in choice if column >= 0]
+        if len(set(taken)) < len(taken):
+            continue
+        weight = np.prod([alone[j] for j in range(k) if j not in taken])
+        weight *= np.prod([missed[i] if j < 0 else pairs[i, j] for i, j in enumerate(choice)])
+        total += weight
+        for row, column in enumerate(choice):
+            if column >= 0:
+                shares[row, column] += weight
+    return shares / total, np.log(total)
+
+
+def random_weights(seed, m, k):
+    rng = np.random.default_rng(seed)
+    return np.exp(rng.normal(0, 3, (m, k))), rng.uniform(0.02, 1, m), rng.uniform(0.1, 1, k)
+
+
+ASSOCIATE = jax.jit(associate)
+
+
+def by_propagation(pairs, missed, alone):
+    """The same, of up to three rows and columns: one program, in which others have no pair."""
+    m, k = pairs.shape
+    wide = jnp.zeros((3, 3)).at[:m, :k].set(pairs.astype(np.float32))
+    rows, columns = jnp.ones(3).at[:m].set(missed), jnp.ones(3).at[:k].set(alone)
+    result = ASSOCIATE(wide, rows, columns)
+    shares = wide * result.replies / result.row_sums[:, None]
+    return np.asarray(shares)[:m, :k], float(result.log_total)
+
+
+def test_associations_without_a_cycle_are_exact():
+    for seed, (m, k) in enumerate([(1, 1), (1, 3), (3, 1), (2, 1), (1, 2)] * 3):
+        weights = random_weights(seed, m, k)
+        shares, log_total = enumerated(*weights)
+        found, total = by_propagation(*weights)
+        np.testing.assert_allclose(found, shares, atol=1e-5)
+        np.testing.assert_allclose(total, log_total, atol=2e-5)
+
+
+def test_two_certain_objects_share_a_measurement_evenly():
+    """Weights so far apart that sums in float32 lose one of them."""
+    found, total = by_propagation(np.full((2, 1), 1e8), np.full(2, 1e-12), np.ones(1))
+    np.testing.assert_allclose(found, 0.5, atol=1e-4)
+    np.testing.assert_allclose(total, np.log(2e-4), atol=1e-3)
+
+
+def test_other_associations_are_near_the_exact_ones():
+    gaps, totals = [], []
+    for seed, (m, k) in enumerate([(2, 2), (3, 2), (2, 3), (3, 3)] * 15):
+        weights = random_weights(seed, m, k)
+        shares, log_total = enumerated(*weights)
+        found, total = by_propagation(*weights)
+        gaps.append(np.abs(found - shares).max())
+        totals.append(total - log_total)
+    assert np.mean(gaps) < 0.03
+    assert np.max(gaps) < 0.41
+    # Bethe's total is never more than the exact one.
+    assert np.max(totals) < 1e-4
+    assert np.mean(totals) > -0.1
+
+
+def test_derivatives_of_associations():
+    """That of the total is the probability of a pair; that of a probability by differences."""
+    pairs, missed, alone = map(jnp.float32, random_weights(3, 3, 3))
+
+    def total(log_pairs):
+        return ASSOCIATE(jnp.exp(log_pairs), missed, alone).log_total
+
+    found = by_propagation(*map(np.asarray, (pairs, missed, alone)))[0]
+    np.testing.assert_allclose(jax.grad(total)(jnp.log(pairs)), found, atol=1e-3)
+
+    def first(log_pair):
+        changed = pairs.at[0, 0].set(jnp.exp(log_pair))
+        result = ASSOCIATE(changed, missed, alone)
+        return changed[0, 0] * result.replies[0, 0] / result.row_sums[0]
+
+    at, step = jnp.log(pairs[0, 0]), 0.02
+    slope = (first(at + step) - first(at - step)) / (2 * step)
+    np.testing.assert_allclose(jax.grad(first)(at), slope, rtol=0.1, atol=2e-3)
+
+
+def model(rate=0.5, **options):
+    options = {"survival_probability": 0.95, "initial_number": 0.0} | options
+    return TargetsModel(SENSOR, GaussianBirth(rate, OBJECT), **options)
+
+
+def bernoulli_mixture(filter, states, existence):
+    """Objects of these particles, (m, n, 1), and no others, after as many empty slots."""
+    m, n = states.shape[:2]
+    mixture = filter.init(KEY)
+    empty = mixture.num_particles - m * n
+    weights = np.repeat(np.asarray(existence) / n / np.sum(existence), n)
+    labels = np.arange(filter.num_components, dtype=np.int32)
+    memory = mixture.memory[TARGETS] | {
+        "number": jnp.float32(np.sum(existence)),
+        "labels": jnp.where(labels <= m, labels, 0),
+        "next_label": jnp.int32(m + 1),
+    }
+    log_weights = np.append(np.full(empty, -np.inf), np.log(weights))
+    indicators = np.append(np.zeros(empty, int), np.repeat(np.arange(1, m + 1), n))
+    return mixture.replace(
+        particles=jnp.pad(jnp.asarray(states.reshape(-1, 1), jnp.float32), ((empty, 0), (0, 0))),
+        log_weights=jnp.asarray(log_weights, jnp.float32),
+        component_indicators=jnp.asarray(indicators, jnp.int32),
+        memory=mixture.memory | {TARGETS: memory},
+    )
+
+
+def density(z, mean, variance):
+    return scipy.stats.norm.pdf(z, mean, np.sqrt(variance))
+
+
+@pytest.mark.parametrize("apart", [12.0, 1.0])
+def test_one_scan_is_that_of_all_associations(apart):
+    """Existence of old and new objects, their number, and the evidence."""
+    n, existence, scan = 400, np.array([0.9, 0.5, 0.2]), np.array([0.3, apart, 2 * apart + 0.5])
+    rng, targets = np.random.default_rng(0), model()
+    states = rng.normal(0, 0.5, (3, n, 1)) + apart * np.arange(3)[:, None, None]
+    filter = Filter(targets, [Associate(400, 100)], 3 * n + 100, 8)
+    mixture = bernoulli_mixture(filter, states, existence)
+    padded = jnp.asarray(np.append(scan, NAN)[:, None], jnp.float32)
+    moved, info = filter.step(KEY, mixture, padded)
+
+    r, rate = 0.95 * existence, 0.5
+    likelihoods = density(scan, states[..., 0][..., None], R).mean(axis=1) / CLUTTER
+    pairs, missed = r[:, None] * P_D * likelihoods, 1 - r * P_D
+    births = rate * P_D * density(scan, 0.0, P0 + R) / CLUTTER
+    shares, log_total = enumerated(pairs, missed, 1 + births)
+    of_none = 1 - shares.sum(axis=1)
+    old = of_none * r * (1 - P_D) / missed + shares.sum(axis=1)
+    new = (1 - shares.sum(axis=0)) * births / (1 + births)
+    found = mpfjax.targets(moved)
+    close = 1e-3 if apart > 10 else 0.12
+    by_label = dict(zip(np.asarray(found.labels), np.asarray(found.existence), strict=True))
+    np.testing.assert_allclose([by_label[k] for k in (1, 2, 3)], old, atol=close)
+    started = np.sort([by_label[k] for k in by_label if k > 3])[::-1]
+    np.testing.assert_allclose(started, np.sort(new[new > 1e-4])[::-1], atol=close)
+    expected = old.sum() + new.sum() + rate * (1 - P_D)
+    np.testing.assert_allclose(found.expected_number, expected, atol=close)
+    log_evidence = log_total - rate * P_D
+    np.testing.assert_allclose(info.log_likelihood_increment, log_evidence, atol=close)
+
+
+def test_a_known_single_object_is_that_of_all_associations():
+    """And E[x_t]; with certain detection and hardly any clutter it is the Kalman filter's."""
+    alone = {"rate": 1e-12, "survival_probability": 1.0}
+    sets, n = jnp.asarray(SETS, jnp.float32), 300
+
+    def run(key, targets, sets):
+        moves = [Predict(), Associate(undetected_particles=1)]
+        filter = Filter(targets, moves, n + 1, 3)
+        keys = jax.random.split(key, 1 + len(sets))
+        mixture = bernoulli_mixture(filter, np.zeros((1, n, 1)), [1.0])
+        mixture = mixture.replace(particles=jax.random.normal(keys[0], (n + 1, 1)))
+
+        def step(mixture, data):
+            mixture, info = filter.step(*data[:1], mixture, data[1])
+            return mixture, info.log_likelihood_increment
+
+        mixture, increments = jax.lax.scan(step, mixture, (keys[1:], sets))
+        return jnp.sum(increments), mpfjax.targets(mixture).means[0, 0]
+
+    run_all = jax.jit(jax.vmap(run, in_axes=(0, None, None)))
+    keys = jax.random.split(KEY, 200)
+    totals, means = run_all(keys, model(**alone), sets)
+    exact, mean = by_associations(SETS)
+    ratios = np.exp(np.asarray(totals)) / exact
+    assert_unbiased(ratios, loosest=0.02)
+    assert_unbiased(ratios * np.asarray(means), mean, loosest=0.02)
+
+    data, clutter = np.array([[0.4], [0.9], [-0.2], [1.5], [-1.0]]), 1e-6
+    sensor = ClutteredModel(OBJECT, 1.0, clutter)
+    certain = TargetsModel(sensor, GaussianBirth(1e-12, OBJECT), 1.0)
+    totals, _ = run_all(keys, certain, jnp.asarray(data[:, None], jnp.float32))
+    kalman = mpfjax.exact.kalman_filter(OBJECT, jnp.asarray(data, jnp.float32))
+    log_z = float(kalman.log_marginal_likelihood) - len(data) * np.log(clutter)
+    assert_unbiased(np.exp(np.asarray(totals, float) - log_z), loosest=0.03)
+
+
+def updated(gaussian, z):
+    """A Gaussian (weight, mean, variance) after a measurement of its own; its weight is l / λ."""
+    weight, mean, variance = gaussian
+    gain = variance / (variance + R)
+    weight = weight * P_D * density(z, mean, variance + R) / CLUTTER
+    return weight, mean + gain * (z - mean), (1 - gain) * variance
+
+
+def predicted(gaussian, survival):
+    weight, mean, variance = gaussian
+    return survival * weight, A * mean, A**2 * variance + Q
+
+
+def test_objects_not_detected_yet_are_those_of_gaussian_sums():
+    """Two scans from a Poisson number of objects, in whose second no two compete."""
+    number, rate, survival = 2.0, 0.5, 0.95
+    first, second = np.array([-2.5, 2.0]), 2.2
+    born = (rate, 0.0, P0)
+    unseen = [predicted((number, 0.0, P0), survival), born]
+    log_evidence = -P_D * sum(w for w, *_ in unseen)
+    objects = []
+    for z in first:
+        parts = [updated(g, z) for g in unseen]
+        odds = sum(w for w, *_ in parts)
+        log_evidence += np.log1p(odds)
+        objects.append([(w / (1 + odds), m, v) for w, m, v in parts])
+    unseen = [((1 - P_D) * w, m, v) for w, m, v in unseen]
+    unseen = [*(predicted(g, survival) for g in unseen), born]
+    log_evidence -= P_D * sum(w for w, *_ in unseen)
+    objects = [[predicted(g, survival) for g in gaussians] for gaussians in objects]
+    r = np.array([sum(w for w, *_ in gaussians) for gaussians in objects])
+    pairs = [sum(updated(g, second)[0] for g in gaussians) for gaussians in objects]
+    started = sum(updated(g, second)[0] for g in unseen)
+    shares, log_total = enumerated(np.c_[pairs], 1 - P_D * r, [1 + started])
+    old = (1 - shares[:, 0]) * r * (1 - P_D) / (1 - P_D * r) + shares[:, 0]
+    new = (1 - shares.sum()) * started / (1 + started)
+    undetected = (1 - P_D) * sum(w for w, *_ in unseen)
+
+    filter = mpfjax.bernoulli_filter(
+        model(rate, survival_probability=survival, initial_number=number), 3000, 6,
+        particles_per_birth=500, undetected_particles=1000, resample=mpfjax.Resample(),
+    )  # fmt: skip
+    scans = jnp.asarray([[[-2.5], [2.0]], [[second], [NAN]]], jnp.float32)
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 20), filter, scans, collect=mpfjax.targets)
+    last = jax.tree.map(lambda leaf: np.asarray(leaf)[:, -1], runs.collected)
+    found = np.stack([np.where(last.labels == k, last.existence, 0).sum(1) for k in (1, 2, 3)], 1)
+    # Labels of the first scan are dealt by the most probable.
+    np.testing.assert_allclose(np.sort(found[:, :2].mean(0)), np.sort(old), atol=0.02)
+    np.testing.assert_allclose(found[:, 2].mean(), new, atol=0.02)
+    np.testing.assert_allclose(last.undetected.mean(), undetected, atol=0.05)
+    exact_number = old.sum() + new + undetected
+    np.testing.assert_allclose(last.expected_number.mean(), exact_number, atol=0.03)
+    log_z = np.asarray(runs.log_marginal_likelihood)
+    np.testing.assert_allclose(log_z.mean(), log_evidence + log_total, atol=0.03)
+
+
+def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
+    """One object that may exist, against the product of the sensors' likelihoods."""
+    near = ClutteredModel(OBJECT, lambda states: jnp.where(states[:, 0] < 1, 0.9, 0.0), CLUTTER)
+    targets = TargetsModel((SENSOR, near), GaussianBirth(1e-12, OBJECT), 0.95)
+    filter = Filter(targets, [Associate(2, 10)], 110, 3)
+    states = np.random.default_rng(0).normal(0.5, 1, (1, 100, 1))
+    mixture, r = bernoulli_mixture(filter, states, [0.9]), 0.95 * 0.9
+    for scan in ([[0.2], [NAN]], [[NAN], [NAN]]):
+        scans = (jnp.asarray(scan), jnp.asarray(scan[::-1]))
+        log_likelihood = targets.log_likelihood(scans, jnp.asarray(states[0], jnp.float32))
+        likelihood = r * np.mean(np.exp(np.asarray(log_likelihood, float)))
+        moved, info = filter.step(KEY, mixture, scans)
+        total = 1 - r + likelihood
+        np.testing.assert_allclose(info.log_likelihood_increment, np.log(total), atol=1e-4)
+        found = mpfjax.targets(moved)
+        assert found.labels.tolist() == [1, 0]
+        np.testing.assert_allclose(found.existence, [likelihood / total, 0], atol=1e-4)
+    moved, info = filter.predict(KEY, mixture)
+    np.testing.assert_allclose(moved.memory[TARGETS]["number"], r, atol=1e-5)
+    assert info.log_likelihood_increment == 0
+    with pytest.raises(ValueError, match="observation: it is not a tuple"):
+        filter.step(KEY, mixture, scans[0])
+
+
+def test_derivatives_of_the_evidence():
+    """Of one scan, whose draws depend on nothing, by p_D and log λ."""
+    scan, targets = jnp.array([[0.2], [1.5], [NAN]]), model(initial_number=1.0)
+
+    @jax.jit
+    def log_evidence(p, log_clutter):
+        sensor = ClutteredModel(OBJECT, p, jnp.exp(log_clutter))
+        changed = TargetsModel(sensor, targets.birth, 0.95, 1.0)
+        filter = mpfjax.bernoulli_filter(changed, 800, 4, resample=mpfjax.Resample())
+        return mpfjax.run_filter(KEY, filter, scan[None]).log_marginal_likelihood
+
+    at, step = (jnp.float32(0.7), jnp.float32(-1.0)), 0.01
+    slopes = jax.grad(log_evidence, argnums=(0, 1))(*at)
+    for k, slope in enumerate(slopes):
+        ends = [log_evidence(*(v + s * step * (j == k) for j, v in enumerate(at))) for s in (-1, 1)]
+        np.testing.assert_allclose(slope, (ends[1] - ends[0]) / (2 * step), rtol=0.02, atol=0.02)
+
+
+def test_objects_without_room_are_told_and_the_table_has_the_rest():
+    sensor = ClutteredModel(OBJECT, 0.9, 1e-4)
+    crowd = TargetsModel(sensor, GaussianBirth(2.0, OBJECT), 0.95)
+    scans = jnp.tile(jnp.array([[-2.0], [0.0], [2.0]]), (3, 1, 1))
+    run = mpfjax.run_filter(
+        KEY, mpfjax.bernoulli_filter(crowd, 900, 2), scans, collect=mpfjax.targets
+    )
+    with pytest.warns(RuntimeWarning, match="there was no room at step 1"):
+        table = mpfjax.track_table(run.collected)
+    assert set(table) == {"step", "label", "existence", "mean_0", "deviation_0"}
+    assert len(table["step"]) == 6
+    assert len(set(zip(table["step"], table["label"], strict=True))) == 6
+    # The others still count.
+    np.testing.assert_allclose(run.collected.expected_number[-1], 3, atol=0.7)
+    with pytest.raises(ValueError, match="slots: "):
+        mpfjax.monte_carlo(KEY[None], mpfjax.bernoulli_filter(crowd, 900, 2), scans, slots=600)
+    with pytest.raises(ValueError, match="model: "):
+        Filter(OBJECT, [Predict(), Associate()], 1000, 3)
+    with pytest.raises(ValueError, match="num_particles: 100 is less than 402"):
+        Filter(crowd, [Predict(), Associate()], 100, 3)
+
+
+def test_the_number_is_that_of_independent_events():
+    existence = np.array([0.9, 0.5, 0.0, 0.2])
+    exact = np.zeros(5)
+    for there in itertools.product([0, 1], repeat=4):
+        exact[sum(there)] += np.prod(np.where(there, existence, 1 - existence))
+    np.testing.assert_allclose(mpfjax.number_distribution(jnp.asarray(existence)), exact, atol=1e-6)
+
+
+def test_quantiles_are_those_of_each_object():
+    states = np.stack([np.linspace(0, 1, 101), np.linspace(5, 7, 101)])[..., None]
+    filter = Filter(model(), [Predict(), Associate(50, 10)], 212, 3)
+    found = mpfjax.targets(bernoulli_mixture(filter, states, [0.5, 0.25]), q=(0.1, 0.5))
+    np.testing.assert_allclose(found.quantiles[..., 0], [[0.1, 0.5], [5.2, 6.0]], atol=0.03)
+    np.testing.assert_allclose(found.existence, [0.5, 0.25], atol=1e-6)
+
+
+@pytest.mark.parametrize("region", [mpfjax.Box([-1, 0], [2, 1]), mpfjax.Disc([0.5, 0], 0.8)])
+def test_new_objects_are_even_in_a_region(region):
+    """The importance weights at a measurement integrate the same density as draws anywhere."""
+
+    def locate(key, z, n):
+        offsets = 0.3 * jax.random.normal(key, (n, 2))
+        return z[None] + offsets, jnp.sum(jax.scipy.stats.norm.logpdf(offsets, scale=0.3), 1)
+
+    birth = mpfjax.UniformBirth(1.0, region, lambda key, places: places, locate)
+    states = birth.sample(KEY, 20_000)
+    z = jnp.array([0.4, 0.5])
+
+    def near(places):
+        return jnp.exp(-jnp.sum((places - z[None]) ** 2, 1) / 0.18)
+
+    proposed, log_weights = birth.propose(KEY, z, 20_000)
+    expected = np.asarray(near(states))
+    found = np.asarray(near(proposed) * jnp.exp(log_weights))
+    error = np.hypot(expected.std(), found.std()) / np.sqrt(20_000)
+    assert abs(expected.mean() - found.mean()) < 4 * error < 0.03
