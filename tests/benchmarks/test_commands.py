@@ -25,6 +25,7 @@ COMMANDS = {
     "localisation": "localisation.json recovery.png",
     "marginalised": "marginalised.json",
     "masses": "masses.json masses.png",
+    "multi_target": "multi_target.json multi_target.png",
     "partitioned_sampling": "partitioned_sampling.json uniqueness.png",
     "peers": "peers.json peers.png",
     "scaling": "scaling.json",
