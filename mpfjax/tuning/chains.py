@@ -4,6 +4,7 @@ import abc
 import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypedDict
 
 import equinox as eqx
@@ -28,13 +29,36 @@ _MOST_BYTES_AT_ONCE = 2**24
 _SECONDS_BETWEEN = 0.5
 
 
+@dataclass(frozen=True, kw_only=True)
+class PosteriorOfChains:
+    """What the chains of every sampler leave, after their burn-in."""
+
+    parameters: dict[str, np.ndarray]
+    """by name, on their own scale: shape (chains, draws, ...)."""
+    accepted: Float[np.ndarray, "chains draws"] | Bool[np.ndarray, "chains draws"]
+    """which of these steps moved, or the share of their Metropolis steps that did."""
+    stopped: str | None = None
+    """why they ended before `num_steps`, or None."""
+    num_invalid: dict[str, np.ndarray] = field(default_factory=dict)
+    """by density: how often in each chain it was NaN or +inf, in all its steps."""
+    proposal_covariance: Float[np.ndarray, "d d"] | None = None
+    """of the random walk after burn-in, in unconstrained numbers, in the order of their names."""
+    problem: Problem | None = field(default=None, repr=False, compare=False)
+    """what was sampled: the filter, its parameters and the observations."""
+
+    @property
+    def acceptance_rate(self) -> float:
+        """The share of steps, or of Metropolis steps, that moved."""
+        return float(self.accepted.mean())
+
+
 class Step(NamedTuple):
     """The result of one step of one chain."""
 
     state: Any
     """where the chain is; its `reals` are the parameters."""
-    report: PyTree
-    """what is kept of the step."""
+    report: tuple[Any, ...]
+    """what is kept of the step, the parameters first."""
     acceptance: Float[Array, ""]
     invalid: dict[str, Array]
     """how often a density was NaN or +inf, by its name."""
@@ -97,8 +121,8 @@ class Sampling(Checked):
 
     def run(
         self, kernel: AbstractKernel, settings: dict[str, Any], functions: dict[str, Any]
-    ) -> tuple[PyTree, dict[str, Any]]:
-        """The draws, leaves (chains, draws, ...), and further fields of a posterior.
+    ) -> tuple[list[PyTree], dict[str, Any]]:
+        """What reports hold beside the parameters, leaves (chains, draws, ...), and other fields.
 
         The last two arguments are those of `identity_of`.
         """
@@ -111,51 +135,52 @@ class Sampling(Checked):
         last = self.burn_in + num_draws * self.thinning
         run = LongRun(self.caller, last, self.checkpoint, self.progress, lambda step: identity)
         key_starts, key_steps = jax.random.split(self.key)
-        starts = self._starts(key_starts)
-        at = eqx.filter_eval_shape(self._chains_at, kernel, key_starts, starts)
-        report = eqx.filter_eval_shape(_one_step, kernel, key_steps, at[0], 0).report
-        none = jax.tree.map(lambda leaf: np.empty((0, *leaf.shape), leaf.dtype), report)
+        like, _, none = eqx.filter_eval_shape(self._starts, kernel, key_starts)
+        none = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), none)
 
         def start() -> State:
-            return State(0, self._started(kernel, key_starts, starts), none)
+            return State(0, self._started(kernel, key_starts), none)
 
-        advance = self._advance(kernel, key_steps, report)
-        state, stopped = run.go(State(0, at[0], none), start, advance)
-        draws = jax.tree.map(lambda rows: np.moveaxis(rows[:num_draws], 0, 1), state.rows)
+        advance = self._advance(kernel, key_steps, none)
+        state, stopped = run.go(State(0, like, none), start, advance)
+        reals, *rest = jax.tree.map(lambda rows: np.moveaxis(rows[:num_draws], 0, 1), state.rows)
         num_invalid = jax.tree.map(np.asarray, state.carry.num_invalid)
         warn_of_invalid(self.caller, num_invalid)
         factor = np.asarray(state.carry.walk.factor)
-        fields = {"num_invalid": num_invalid, "stopped": stopped, "problem": self.problem}
-        return draws, fields | {"proposal_covariance": factor @ factor.T}
+        return rest, {
+            "parameters": self.problem.constrained_rows(reals), "problem": self.problem,
+            "proposal_covariance": factor @ factor.T, "num_invalid": num_invalid,
+            "stopped": stopped,
+        }  # fmt: skip
 
-    def _starts(self, key: Key[Array, ""]) -> Reals:
-        """Where each chain starts: the filter's own parameters, or a draw of the prior."""
+    def _starts(
+        self, kernel: AbstractKernel, key: Key[Array, ""]
+    ) -> tuple[Chains, Bool[Array, " chains"], PyTree]:
+        """All chains at the filter's own parameters, or at draws of the prior.
+
+        Also which can start there, and reports of no steps.
+        """
+        num = self.num_chains
         if self.sample_prior is not None:
-            return drawn(key, self.problem, self.sample_prior, self.num_chains)
-        return jax.tree.map(
-            lambda reals: jnp.broadcast_to(reals, (self.num_chains, *reals.shape)),
-            self.problem.start(),
-        )
-
-    def _chains_at(
-        self, kernel: AbstractKernel, key: Key[Array, ""], reals: Reals
-    ) -> tuple[Chains, Bool[Array, " chains"]]:
-        """All chains at some parameters, and which can start there."""
-        keys = jax.random.split(key, self.num_chains)
+            reals = drawn(key, self.problem, self.sample_prior, num)
+        else:
+            start = self.problem.start()
+            reals = jax.tree.map(lambda u: jnp.broadcast_to(u, (num, *u.shape)), start)
+        keys = jax.random.split(key, num)
         return _start_all(kernel, keys, reals, random_walk(self.deviations, reals))
 
-    def _started(self, kernel: AbstractKernel, key: Key[Array, ""], reals: Reals) -> Chains:
+    def _started(self, kernel: AbstractKernel, key: Key[Array, ""]) -> Chains:
         """All chains at their starts.
 
         A draw of the prior at which a chain cannot start is drawn again.
         """
-        chains, fine = self._chains_at(kernel, key, reals)
+        chains, fine, _ = self._starts(kernel, key)
         where = "the start" if self.sample_prior is None else "any draw of sample_prior"
         for attempt in range(1, _MOST_DRAWS_OF_A_START if self.sample_prior else 1):
             if np.all(fine):
                 break
             again = jax.random.fold_in(key, attempt)
-            new, now_fine = self._chains_at(kernel, again, self._starts(again))
+            new, now_fine, _ = self._starts(kernel, again)
             states = jax.vmap(chosen)(fine, chains.states, new.states)
             walk = random_walk(self.deviations, states.reals)
             chains, fine = Chains(states, walk, chains.num_invalid), fine | now_fine
@@ -168,11 +193,11 @@ class Sampling(Checked):
         return max(step - self.burn_in, 0) // self.thinning
 
     def _advance(
-        self, kernel: AbstractKernel, key: Key[Array, ""], report: PyTree
+        self, kernel: AbstractKernel, key: Key[Array, ""], none: PyTree
     ) -> Callable[..., Any]:
-        """Some steps of all chains, about as many as take half a second."""
+        """Some steps of all chains, about as many as take half a second; `none` are no reports."""
         length = 1
-        size = 8 * sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(report))
+        size = 8 * sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves(none))
         capacity = max(2, min(_MOST_DRAWS_AT_ONCE, _MOST_BYTES_AT_ONCE // max(size, 1)))
 
         def advance(step: int, last: int, chains: Chains) -> tuple[int, Chains, PyTree]:
@@ -203,11 +228,12 @@ def warn_of_invalid(caller: str, num_invalid: Mapping[str, Any]) -> None:
 
 @jit_on_wide_vectors
 def _start_all(kernel, keys, reals, walk):
-    """All chains at their starts, and which could start."""
+    """All chains at their starts, which could start, and reports of no steps."""
     states, fine = jax.vmap(kernel.start)(keys, reals)
     steps = eqx.filter_eval_shape(_all_steps, kernel, keys[0], Chains(states, walk, {}), 0)
     counts = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jnp.int32), steps.invalid)
-    return Chains(states, walk, counts), fine
+    none = jax.tree.map(lambda leaf: jnp.zeros((0, *leaf.shape), leaf.dtype), steps.report)
+    return Chains(states, walk, counts), fine, none
 
 
 def _all_steps(kernel: Any, key: Key[Array, ""], chains: Chains, step: Any) -> Step:
@@ -215,10 +241,6 @@ def _all_steps(kernel: Any, key: Key[Array, ""], chains: Chains, step: Any) -> S
     num_chains = jax.tree.leaves(chains.states)[0].shape[0]
     keys = jax.random.split(jax.random.fold_in(key, step), num_chains)
     return jax.vmap(kernel.step, in_axes=(0, 0, None))(keys, chains.states, chains.walk)
-
-
-# Traced once for calls of the same shapes: only the shapes of its report are asked for.
-_one_step = jit_on_wide_vectors(_all_steps)
 
 
 @jit_on_wide_vectors

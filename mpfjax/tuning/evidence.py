@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import Rule, kinds, warn
 from mpfjax.filter import Filter
 from mpfjax.models.observations import Series, as_series, gathered
-from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.base import all_of
 from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.running.scan import FilterRun, scan
 from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, placed, pose
@@ -83,30 +83,18 @@ def warn_of_bias(caller: str, problem: Problem) -> None:
     It does not warn for parameters of proposals, whose bound is maximised without the derivative of
     the resampling, nor for filters that never resample.
     """
-    of_proposals = {
-        place.index
-        for node in _nodes(placed(problem.tree), AbstractProposal)
-        for place in jax.tree.leaves(node)
-        if isinstance(place, Place)
-    }
-    names = [name for name, index in problem.tuned if index not in of_proposals]
-    moves = [move for move in _nodes(problem.tree, AbstractMove) if move.biases_score]
+
+    def is_proposal(node: Any) -> bool:
+        return isinstance(node, AbstractProposal)
+
+    nodes = jax.tree.leaves(placed(problem.tree), is_leaf=is_proposal)
+    places = jax.tree.leaves(list(filter(is_proposal, nodes)))
+    names = [name for name, index in problem.tuned if Place(index) not in places]
+    moves = [move for move in all_of(problem.tree.moves) if move.biases_score]
     if names and moves:
-        said = f"{caller}: {type(moves[-1]).__name__} has no gradient, so that the score of"
+        said = f"{caller}: {type(moves[0]).__name__} has no gradient, so that the score of"
         said += f' {", ".join(names)} is biased; build the filter with gradient="stop"'
         warn(said, UserWarning)
-
-
-def _nodes(tree: PyTree, kind: type) -> list[Any]:
-    """The nodes of a kind, anywhere in a pytree, also within one another."""
-    found: list[Any] = []
-
-    def looked_at(node: Any) -> bool:
-        found.extend([node] if isinstance(node, kind) else [])
-        return False
-
-    jax.tree.leaves(tree, is_leaf=looked_at)
-    return found
 
 
 def with_present(series: Series) -> Series:

@@ -1,7 +1,7 @@
 """The posterior of parameters and states together, by particle Gibbs."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Unpack, cast
 
 import equinox as eqx
@@ -24,7 +24,7 @@ from mpfjax.smoothing.conditional import (
     renew,
     shape_of_trajectory,
 )
-from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Sampling, Step
+from mpfjax.tuning.chains import AbstractKernel, ChainOptions, PosteriorOfChains, Sampling, Step
 from mpfjax.tuning.densities import (
     LogPrior,
     Point,
@@ -43,32 +43,19 @@ _NUM_METROPOLIS_STEPS = 5  # for one new trajectory; they cost little
 Draw = Callable[[Key[Array, ""], PyTree, PyTree, Any], Mapping[str, Any]]
 
 
-@dataclass(frozen=True)
-class GibbsPosterior:
-    """The chains of `particle_gibbs`, after their burn-in."""
+@dataclass(frozen=True, kw_only=True)
+class GibbsPosterior(PosteriorOfChains):
+    """The chains of `particle_gibbs`, after their burn-in.
 
-    parameters: dict[str, np.ndarray]
-    """by name, on their own scale: shape (chains, draws, ...)."""
+    `accepted` is 1 where the parameters are drawn. What is counted where it was no number are the
+    `log_prior` and `log_joint` of a proposal, the numbers of `draw`, and densities in the
+    `conditional_filter`.
+    """
+
     trajectories: PyTree
     """x_0, ..., x_t of every draw, leaves (chains, draws, t + 1, ...), or what `collect` made."""
-    accepted: Float[np.ndarray, "chains draws"]
-    """the share of these steps' Metropolis steps that moved; 1 where the parameters are drawn."""
     renewed: Bool[np.ndarray, "chains draws times"]
     """which states of the trajectory changed in these steps."""
-    stopped: str | None = None
-    """why they ended before `num_steps`, or None."""
-    num_invalid: dict[str, np.ndarray] = field(default_factory=dict)
-    """how often in each chain, in all its steps, the `log_prior` or `log_joint` of a proposal, the
-    numbers of `draw`, or densities in the `conditional_filter` were NaN or +inf."""
-    proposal_covariance: Float[np.ndarray, "d d"] | None = None
-    """of the random walk after burn-in, in unconstrained numbers, in the order of their names."""
-    problem: Problem | None = field(default=None, repr=False, compare=False)
-    """what was sampled: the filter, its parameters and the observations."""
-
-    @property
-    def acceptance_rate(self) -> float:
-        """The share of Metropolis steps that moved."""
-        return float(self.accepted.mean())
 
     @property
     def renewal_rates(self) -> Float[np.ndarray, " times"]:
@@ -136,8 +123,8 @@ def particle_gibbs(
         raise ValueError("draw, log_prior: exactly one must be given")
     backward = callable(getattr(filter.model, "log_transition", None))
     check_conditional(filter, backward, "particle_gibbs")
-    joint = LogJoint(one_sequence(observations, filter.model))
-    problem = pose(filter, joint, parameters, transforms)
+    series = one_sequence(observations, filter.model)
+    problem = pose(filter, LogJoint(series), parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())
     sampling = Sampling("particle_gibbs", key, problem, deviations, num_steps, **options)
     prior = None
@@ -145,20 +132,14 @@ def particle_gibbs(
         for density in ("log_transition", "log_initial"):
             require(filter.model, density, "particle_gibbs with log_prior")
         prior = checked_prior(log_prior, problem, key, sampling.sample_prior)
-    kernel = _Kernel(problem, joint, prior, draw, collect, backward)
-    start = problem.start()
-    trajectory = shape_of_trajectory(filter.model, joint.series.length + 1)
+    kernel = _Kernel(problem, prior, draw, collect, backward)
+    start, trajectory = problem.start(), shape_of_trajectory(filter.model, series.length + 1)
+    functions = {"log_prior": (prior, start), "collect": (collect, trajectory)}
     if draw is not None:  # Names and shapes are checked before anything compiles.
         jax.eval_shape(kernel.drawn, key, start, trajectory)
-    functions = {
-        "draw": (None if draw is None else kernel.drawn, key, start, trajectory),
-        "log_prior": (prior, start), "collect": (collect, trajectory),
-    }  # fmt: skip
-    (reals, kept, accepted, renewed), fields = sampling.run(
-        kernel, {"observations": joint.series}, functions
-    )
-    drawn = problem.constrained_rows(reals)
-    return GibbsPosterior(drawn, kept, accepted, renewed, **fields)
+        functions["draw"] = (kernel.drawn, key, start, trajectory)
+    (kept, accepted, renewed), fields = sampling.run(kernel, {"observations": series}, functions)
+    return GibbsPosterior(trajectories=kept, accepted=accepted, renewed=renewed, **fields)
 
 
 class LogJoint(eqx.Module):
@@ -169,10 +150,8 @@ class LogJoint(eqx.Module):
     def __call__(self, trajectory: PyTree, filter: Filter) -> Float[Array, ""]:
         """With the parameters of the filter's model."""
         model: Any = filter.model
-        start, after = (
-            jax.tree.map(lambda leaf, cut=cut: leaf[cut], trajectory)
-            for cut in (slice(0, 1), slice(1, None))
-        )
+        start = jax.tree.map(lambda leaf: leaf[:1], trajectory)
+        after = jax.tree.map(lambda leaf: leaf[1:], trajectory)
 
         def log_likelihood(observation: PyTree, inputs: PyTree, state: PyTree) -> Float[Array, ""]:
             one = jax.tree.map(lambda leaf: leaf[None], state)
@@ -193,10 +172,9 @@ class _Pair(eqx.Module):
 
 
 class _Kernel(AbstractKernel):
-    """One step of a chain: the parameters, then the trajectory."""
+    """One step of a chain: the parameters, then the trajectory; the objective is a `LogJoint`."""
 
     problem: Problem
-    joint: LogJoint
     prior: Prior | None
     draw: Draw | None
     collect: Callable[[PyTree], PyTree] | None
@@ -210,8 +188,7 @@ class _Kernel(AbstractKernel):
     def start(self, key: Key[Array, ""], reals: Reals) -> tuple[_Pair, Bool[Array, ""]]:
         """A trajectory of an ordinary run, and whether there is one."""
         key_run, key_back = jax.random.split(key)
-        filter = self.problem.at(reals)
-        series = self.joint.series
+        filter, series = self.problem.at(reals), self.problem.objective.series
         run = scan(key_run, filter, series, None)
         drawn = draw_trajectory(
             key_back, filter.model, run, series.inputs, self.backward, checked=False
@@ -228,20 +205,18 @@ class _Kernel(AbstractKernel):
         move = self._metropolis if self.draw is None else self._gibbs
         reals, accepted, invalid = move(key_parameters, state.reals, state.trajectory, walk)
         filter, before = self.problem.at(reals), state.trajectory
-        series = self.joint.series
+        series = self.problem.objective.series
         found = renew(key_trajectory, filter, series, before, self.backward, checked=False)
+        possible = possible_times(filter.model, found.trajectory, series.inputs)
         broken = jnp.any(is_invalid(found.run.log_likelihood_increments))
-        broken |= ~jnp.all(found.possible) | ~jnp.all(
-            possible_times(filter.model, found.trajectory, series.inputs)
-        )
+        broken |= ~jnp.all(found.possible & possible)
         pair = chosen(~broken, _Pair(reals, found.trajectory), state)
         invalid["conditional_filter"] = broken
-        changes = [
-            jnp.any((new != old).reshape(new.shape[0], -1), axis=1)
-            for new, old in zip(
-                jax.tree.leaves(pair.trajectory), jax.tree.leaves(before), strict=True
-            )
-        ]
+
+        def changed(new: Array, old: Array) -> Bool[Array, " times"]:
+            return jnp.any((new != old).reshape(new.shape[0], -1), axis=1)
+
+        changes = jax.tree.leaves(jax.tree.map(changed, pair.trajectory, before))
         kept = pair.trajectory
         if self.collect is not None:
             with saying("collect", "called with a trajectory"):
@@ -262,7 +237,7 @@ class _Kernel(AbstractKernel):
         """The user's draw, in unconstrained numbers."""
         filter = self.problem.at(reals)
         with saying("draw", "called with a key, trajectory, observations and model"):
-            observations = self.joint.series.observations
+            observations = self.problem.objective.series.observations
             drawn = cast(Draw, self.draw)(key, trajectory, observations, filter.model)
         return self.problem.unconstrain(drawn, "draw")
 
@@ -274,7 +249,7 @@ class _Kernel(AbstractKernel):
 
         def evaluate(key: Key[Array, ""], reals: Reals) -> tuple[Point, dict[str, Array]]:
             del key
-            log_joint = self.joint(trajectory, self.problem.at(reals))
+            log_joint = self.problem.objective(trajectory, self.problem.at(reals))
             return evaluated(reals, prior(reals), log_joint, "log_joint")
 
         def move(point: Point, key: Key[Array, ""]) -> tuple[Point, Any]:

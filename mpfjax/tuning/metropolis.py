@@ -9,39 +9,25 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import Count, checked
-from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Sampling, Step
+from mpfjax.tuning.chains import AbstractKernel, ChainOptions, PosteriorOfChains, Sampling, Step
 from mpfjax.tuning.densities import LogDensity, LogPrior, Point, checked_prior
 from mpfjax.tuning.evidence import UnbiasedFilter, pose_evidence
-from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms
+from mpfjax.tuning.problem import Parameters, Reals, Transforms
 from mpfjax.tuning.walks import RandomWalk, checked_deviations, metropolis_step
 
 
-@dataclass(frozen=True)
-class Posterior:
-    """The chains of `metropolis_hastings`, after their burn-in."""
+@dataclass(frozen=True, kw_only=True)
+class Posterior(PosteriorOfChains):
+    """The chains of `metropolis_hastings`, after their burn-in.
 
-    parameters: dict[str, np.ndarray]
-    """by name, on their own scale: shape (chains, draws, ...)."""
+    Densities that are counted where they were no numbers are a proposal's `log_prior` and
+    `log_marginal_likelihood`.
+    """
+
     log_marginal_likelihoods: Float[np.ndarray, "chains draws"]
     """log Ẑ of every draw, summed over sequences."""
-    accepted: Bool[np.ndarray, "chains draws"]
-    """which of these steps moved."""
-    stopped: str | None = None
-    """why they ended before `num_steps`, or None."""
-    num_invalid: dict[str, np.ndarray] = field(default_factory=dict)
-    """how often in each chain a proposal's `log_prior` or `log_marginal_likelihood` was NaN or
-    +inf, in all its steps."""
-    proposal_covariance: Float[np.ndarray, "d d"] | None = None
-    """of the random walk after burn-in, in unconstrained numbers, in the order of their names."""
     key_data: Any = field(default=None, repr=False)
     """of the key with which the filter ran for each log Ẑ."""
-    problem: Problem | None = field(default=None, repr=False, compare=False)
-    """what was sampled: the filter, its parameters and the observations."""
-
-    @property
-    def acceptance_rate(self) -> float:
-        """The share of steps that moved."""
-        return float(self.accepted.mean())
 
 
 @checked
@@ -112,8 +98,10 @@ def metropolis_hastings(
     density = LogDensity(problem, prior)
     data = {"observations": problem.objective}
     functions = {"log_prior": (prior, problem.start())}
-    rows, fields = sampling.run(_Kernel(density), data, functions)
-    return Posterior(problem.constrained_rows(rows[0]), *rows[1:3], key_data=rows[3], **fields)
+    (values, accepted, key_data), fields = sampling.run(_Kernel(density), data, functions)
+    return Posterior(
+        log_marginal_likelihoods=values, accepted=accepted, key_data=key_data, **fields
+    )
 
 
 class _Kernel(AbstractKernel):

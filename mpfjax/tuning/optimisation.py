@@ -189,9 +189,9 @@ class _Ascent:
         run = LongRun(self.caller, num_steps, checkpoint, progress, lambda step: identity)
         state, stopped = run.go(start, lambda: start, self._advance)
         (reals, _), (values, deviations, path) = state.carry, state.rows
-        seeds, _, fault = self._evaluated(state.step, reals)
-        value = float(seeds.mean())
-        if fault is not None:
+        try:
+            value = float(self._evaluated(state.step, reals)[0].mean())
+        except Broken as fault:
             # The parameters are those of the step before, and so is their value.
             if stopped is None:
                 stopped = f"{fault} at step {state.step}"
@@ -202,24 +202,22 @@ class _Ascent:
         parameters = jax.tree.map(np.asarray, self.problem.constrain(reals))
         return reals, (self.problem.at(reals), parameters, value, history, stopped)
 
-    def _evaluated(self, step: int, reals: Reals) -> tuple[np.ndarray, Reals, str | None]:
-        """The objective of each seed, the gradient of their mean, and what is not finite, if so."""
+    def _evaluated(self, step: int, reals: Reals) -> tuple[np.ndarray, Reals]:
+        """The objective of each seed, and the gradient of their mean; `Broken` if not finite."""
         keys = jax.random.split(jax.random.fold_in(self.key, step), self.num_seeds)
         values, gradient = scores(self.problem, reals, keys)
         values, named = np.asarray(values), self.objective.replace("_", " ")
         broken = [name for name, leaf in gradient.items() if not np.isfinite(leaf).all()]
         if not np.isfinite(values).all():
-            return values, gradient, f"the {named} was {values.mean()}"
+            raise Broken(f"the {named} was {values.mean()}")
         if broken:
-            return values, gradient, f"the gradient of {', '.join(broken)} was not finite"
-        return values, gradient, None
+            raise Broken(f"the gradient of {', '.join(broken)} was not finite")
+        return values, gradient
 
     def _advance(self, step: int, last: int, carry: PyTree) -> tuple[int, PyTree, PyTree]:
         """One step up."""
         reals, optimizer = carry
-        values, gradient, fault = self._evaluated(step, reals)
-        if fault is not None:
-            raise Broken(fault)
+        values, gradient = self._evaluated(step, reals)
         idle = [name for name, leaf in gradient.items() if not np.asarray(leaf).any()]
         if step == 0 and idle:
             named = self.objective.replace("_", " ")

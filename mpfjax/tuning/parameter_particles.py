@@ -2,7 +2,7 @@
 
 import dataclasses
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,65 +22,26 @@ from mpfjax.tuning.problem import Problem, Reals
 from mpfjax.tuning.walks import factor_of, metropolis_step
 
 
-class FilterOf(eqx.Module):
-    """Runs of a filter over the first observations, with one compiled program for any number."""
-
-    series: Series
-    """those there are, and whatever comes after them up to a length that programs share."""
-
-    def start(self, key: Key[Array, ""], filter: Filter) -> ParticleMixture:
-        """The mixture of x_0."""
-        return first_mixture(key, filter, self.series)
-
-    def step(
-        self, key: Key[Array, ""], filter: Filter, mixture: ParticleMixture, t: Int[Array, ""]
-    ) -> tuple[ParticleMixture, Float[Array, ""]]:
-        """The mixture after one more observation, and the increment of log Ẑ."""
-        now = jax.tree.map(lambda leaf: jnp.asarray(leaf)[t], self.series)
-        mixture, info = step_or_predict(filter, key, mixture, now)
-        return mixture, info.log_likelihood_increment
-
-    def __call__(
-        self, key: Key[Array, ""], filter: Filter, num_steps: Int[Array, ""]
-    ) -> tuple[ParticleMixture, Float[Array, ""]]:
-        """The mixture after some observations, and log Ẑ."""
-        key_start, key_steps = jax.random.split(key)
-        mixture = self.start(key_start, filter)
-
-        def advance(t: Int[Array, ""], carry: tuple) -> tuple:
-            mixture, log_evidence = carry
-            mixture, increment = self.step(jax.random.fold_in(key_steps, t), filter, mixture, t)
-            return mixture, log_evidence + increment
-
-        nothing = jnp.zeros((), mixture.log_weights.dtype)
-        return jax.lax.fori_loop(0, num_steps, advance, (mixture, nothing))
-
-
 class Sampler(eqx.Module):
     """The problem that the samples belong to, and their moves; a sample is a θ with its filter."""
 
     problem: Problem
-    run: FilterOf
+    series: Series
+    """the data there are, and whatever comes after them up to a length that programs share."""
     prior: Prior
     num_moves: int = eqx.field(static=True)
-    num_samples: int = eqx.field(static=True)
-
-    @property
-    def num_particles(self) -> int:
-        """N of each θ's filter."""
-        return self.problem.tree.num_particles
 
     def with_particles(self, num_particles: int) -> "Sampler":
         """The same with filters of another number of particles."""
-        if num_particles == self.num_particles:
+        if num_particles == self.problem.tree.num_particles:
             return self
         resized = self.problem.tree.replace(num_particles=num_particles)
-        problem = self.problem.with_structure(jax.tree.structure(resized))
+        problem = dataclasses.replace(self.problem, structure=jax.tree.structure(resized))
         return dataclasses.replace(self, problem=problem)
 
     def start(self, key: Key[Array, ""], reals: Reals) -> Point:
         """A θ with the mixture of x_0."""
-        mixture = self.run.start(key, self.problem.at(reals))
+        mixture = first_mixture(key, self.problem.at(reals), self.series)
         nothing = jnp.zeros((), mixture.log_weights.dtype)
         return Point(reals, number_or_zero(self.prior(reals)), nothing, mixture)
 
@@ -88,29 +49,43 @@ class Sampler(eqx.Module):
         self, key: Key[Array, ""], sample: Point, t: Int[Array, ""]
     ) -> tuple[Point, Float[Array, ""]]:
         """The sample after one more observation, and its increment."""
-        filter = self.problem.at(sample.reals)
-        mixture, increment = self.run.step(key, filter, sample.mixture, t)
+        mixture, increment = self._step(key, self.problem.at(sample.reals), sample.mixture, t)
         log_likelihood = sample.log_likelihood + number_or_zero(increment)
         return Point(sample.reals, sample.log_prior, log_likelihood, mixture), increment
 
     def run_again(
         self, key: Key[Array, ""], reals: Reals, num_steps: Int[Array, ""]
     ) -> tuple[Point, dict[str, Bool[Array, ""]]]:
-        """A θ with a new filter over all observations so far, and what was no number."""
-        mixture, log_evidence = self.run(key, self.problem.at(reals), num_steps)
+        """A θ with a new filter over all observations so far, and what was no number.
+
+        One compiled program does for any number of them.
+        """
+        filter = self.problem.at(reals)
+        key_start, key_steps = jax.random.split(key)
+
+        def advance(t: Int[Array, ""], carry: tuple) -> tuple:
+            mixture, log_evidence = carry
+            mixture, increment = self._step(jax.random.fold_in(key_steps, t), filter, mixture, t)
+            return mixture, log_evidence + increment
+
+        start = first_mixture(key_start, filter, self.series)
+        nothing = jnp.zeros((), start.log_weights.dtype)
+        mixture, log_evidence = jax.lax.fori_loop(0, num_steps, advance, (start, nothing))
         point, invalid = evaluated(reals, self.prior(reals), log_evidence)
         return dataclasses.replace(point, mixture=mixture), invalid
 
+    def _step(
+        self, key: Key[Array, ""], filter: Filter, mixture: ParticleMixture, t: Int[Array, ""]
+    ) -> tuple[ParticleMixture, Float[Array, ""]]:
+        """The mixture after one more observation, and the increment of log Ẑ."""
+        now = jax.tree.map(lambda leaf: jnp.asarray(leaf)[t], self.series)
+        mixture, info = step_or_predict(filter, key, mixture, now)
+        return mixture, info.log_likelihood_increment
 
-class Extended(NamedTuple):
-    """The samples after one more observation."""
 
-    samples: ParticleMixture
-    increment: Float[Array, ""]
-    """the log of their mean likelihood; -inf where none has any."""
-    effective_sample_size: Float[Array, ""]
-    invalid: Int[Array, ""]
-    """how many θs were dropped, since their likelihood was NaN or +inf."""
+Weighed = tuple[ParticleMixture, Float[Array, ""], Float[Array, ""], Int[Array, ""]]
+"""Samples, the log of the mean of their factors (-inf where all are zero), their effective sample
+size, and how many θs were dropped, since their likelihood was NaN or +inf."""
 
 
 def _weighed(
@@ -118,14 +93,14 @@ def _weighed(
     points: Point,
     log_factors: Float[Array, " n"],
     invalid: Bool[Array, " n"],
-) -> Extended:
+) -> Weighed:
     """The points with the samples' weights times these factors; zero stays zero."""
     alive = samples.log_weights > -jnp.inf
     log_weights = jnp.where(alive, samples.log_weights + log_factors, -jnp.inf)
     total = log_sum_exp(log_weights)
     samples = samples.replace(particles=points, log_weights=log_weights - total)
     num_invalid = jnp.sum(alive & invalid, dtype=jnp.int32)
-    return Extended(samples, total, samples.effective_sample_size, num_invalid)
+    return samples, total, samples.effective_sample_size, num_invalid
 
 
 @jit_on_wide_vectors
@@ -140,7 +115,7 @@ def extended(sampler, key, samples, t):
 
     A θ whose likelihood is no number gets the weight zero, and keeps it.
     """
-    keys = jax.random.split(key, sampler.num_samples)
+    keys = jax.random.split(key, samples.num_particles)
     extend = jax.vmap(sampler.extend, in_axes=(0, 0, None))
     points, increments = extend(keys, samples.particles, t)
     return _weighed(samples, points, number_or_zero(increments), is_invalid(increments))
@@ -157,7 +132,7 @@ def rejuvenated(sampler, key, samples, num_steps):
     centred = points - samples.average(points)[None]
     factor = factor_of(samples.average(centred[:, :, None] * centred[:, None, :]))
     num_moves = sampler.num_moves
-    num_chains = sampler.num_samples // (num_moves + 1)
+    num_chains = samples.num_particles // (num_moves + 1)
     resampled = Resample(particles_per_component=num_chains)(key_resample, samples)
     starts = jax.tree.map(lambda leaf: leaf[:num_chains], resampled.particles)
 
@@ -171,11 +146,11 @@ def rejuvenated(sampler, key, samples, num_steps):
         return jax.lax.scan(advance, sample, jax.random.split(key, num_moves))
 
     _, (paths, accepted, invalid) = jax.vmap(chain)(jax.random.split(key_moves, num_chains), starts)
-    everywhere = jax.tree.map(
-        lambda start, path: jnp.concatenate([start, path.reshape(-1, *path.shape[2:])]),
-        starts,
-        paths,
-    )
+
+    def end_to_end(start: Array, path: Array) -> Array:
+        return jnp.concatenate([start, path.reshape(-1, *path.shape[2:])])
+
+    everywhere = jax.tree.map(end_to_end, starts, paths)
     rate = jnp.mean(accepted.astype(samples.log_weights.dtype))
     counts = jax.tree.map(lambda some: jnp.sum(some, dtype=jnp.int32), invalid)
     return single_component(everywhere), rate, counts
@@ -189,7 +164,7 @@ def exchanged(sampler, key, samples, num_steps):
     3.6): each θ gets a new filter over all observations so far, and its weight is multiplied by the
     new Ẑ over the old one. Also the log of the mean of these ratios.
     """
-    keys = jax.random.split(key, sampler.num_samples)
+    keys = jax.random.split(key, samples.num_particles)
     run_again = jax.vmap(sampler.run_again, in_axes=(0, 0, None))
     points, invalid = run_again(keys, samples.particles.reals, num_steps)
     ratios = points.log_likelihood - samples.particles.log_likelihood

@@ -53,10 +53,6 @@ class Problem(eqx.Module):
         tree = "filter" if hasattr(self.tree, "moves") else "model"
         return {tree: self.tree, "parameters": places, "transforms": self.transforms}
 
-    def with_structure(self, structure: Any) -> "Problem":
-        """The same leaves in a tree with other static fields."""
-        return Problem(self.leaves, self.transforms, self.objective, self.tuned, structure)
-
     def start(self) -> Reals:
         """The present parameters; raises `ValueError` for one outside its domain."""
         present = {name: self.leaves[index] for name, index in self.tuned}

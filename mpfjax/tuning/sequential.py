@@ -14,16 +14,9 @@ from mpfjax.models.observations import Series
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.chains import warn_of_invalid
 from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn
-from mpfjax.tuning.evidence import UnbiasedFilter, one_sequence, with_present
-from mpfjax.tuning.parameter_particles import (
-    FilterOf,
-    Sampler,
-    exchanged,
-    extended,
-    rejuvenated,
-    started,
-)
-from mpfjax.tuning.problem import Parameters, Problem, Transforms, pose
+from mpfjax.tuning.evidence import UnbiasedFilter, one_sequence, pose_evidence, with_present
+from mpfjax.tuning.parameter_particles import Sampler, exchanged, extended, rejuvenated, started
+from mpfjax.tuning.problem import Parameters, Problem, Transforms
 
 # The share of their number below which the effective sample size of the θs leads to moves.
 _ESS_THRESHOLD = 0.5
@@ -159,13 +152,12 @@ def smc2(
             f"num_samples: {num_samples} is no multiple of num_moves + 1: {low} or {low + size}"
         )
     series = jax.tree.map(np.asarray, one_sequence(observations, filter.model))
-    runs = _padded(series, series.length)
-    problem = pose(filter, runs, parameters, transforms)
+    problem = pose_evidence(filter, series, parameters, transforms)
     key_prior, key_filters, key_steps = jax.random.split(key, 3)
     reals = drawn(key_prior, problem, sample_prior, num_samples)
     first = jax.tree.map(lambda u: u[0], reals)
     prior = checked_prior(log_prior, problem, key_prior, sample_prior)
-    sampler = Sampler(problem, runs, prior, int(num_moves), int(num_samples))
+    sampler = Sampler(problem, _padded(series, series.length), prior, int(num_moves))
     settings = problem.settings | {
         "key": key, "num_samples": int(num_samples), "num_moves": int(num_moves),
         "max_particles": max_particles,
@@ -199,16 +191,15 @@ class _Run:
         )
         if (before.present is None) != (after.present is None):
             before, after = with_present(before), with_present(after)
-        there, here = (
-            kinds(jax.tree.map(lambda leaf: leaf[-1], series)) for series in (before, after)
-        )
+        ends = jax.tree.map(lambda leaf: leaf[-1], [before, after])
+        there, here = map(kinds, ends)
         if there != here:
             raise ValueError(f"observations: {here} is not like those before, {there}")
         series = jax.tree.map(lambda *leaves: np.concatenate(leaves), before, after)
-        held = self.sampler.run.series.length
+        held = self.sampler.series.length
         # With room for as many more, so that observations that come one by one share a program.
         capacity = held if series.length <= held else max(series.length, 2 * held)
-        sampler = replace(self.sampler, run=_padded(series, capacity))
+        sampler = replace(self.sampler, series=_padded(series, capacity))
         return replace(self, sampler=sampler, series=series, progress=progress)
 
     def posterior(
@@ -230,7 +221,8 @@ class _Run:
         if state is None:
             samples = eqx.filter_eval_shape(started, self.sampler, keys, reals)
             rows = (np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
-            like = State(0, (samples, self.sampler.num_particles, before), rows)
+            num_particles = self.sampler.problem.tree.num_particles
+            like = State(0, (samples, num_particles, before), rows)
             state, stopped = run.go(like, start, self._advance)
         else:
             before = state.carry[2]
@@ -254,14 +246,14 @@ class _Run:
         samples, num_particles, invalid = carry
         counts, sampler = dict(invalid), self.sampler.with_particles(num_particles)
         keys = jax.random.split(jax.random.fold_in(self.key, step), 3)
-        found = extended(sampler, keys[0], samples, jnp.asarray(step, jnp.int32))
-        counts["log_marginal_likelihood"] += int(found.invalid)
-        increment, size, rate = float(found.increment), float(found.effective_sample_size), np.nan
+        samples, *numbers = extended(sampler, keys[0], samples, jnp.asarray(step, jnp.int32))
+        increment, size, num_invalid = map(float, numbers)
+        counts["log_marginal_likelihood"] += int(num_invalid)
+        rate = np.nan
         if increment == -np.inf:
-            broken = f", NaN or +inf in {int(found.invalid)}," if int(found.invalid) else ""
+            broken = f", NaN or +inf in {num_invalid:g}," if num_invalid else ""
             raise Broken(f"no sample has any likelihood{broken}")
-        samples = found.samples
-        if size < _ESS_THRESHOLD * sampler.num_samples:
+        if size < _ESS_THRESHOLD * samples.num_particles:
             so_far = jnp.asarray(step + 1, jnp.int32)
             samples, accepted, of_moves = rejuvenated(sampler, keys[1], samples, so_far)
             rate = float(accepted)
@@ -269,20 +261,20 @@ class _Run:
             may_double = self.max_particles is not None and 2 * num_particles <= self.max_particles
             if may_double and rate < _ACCEPTANCE_THRESHOLD:
                 larger = self.sampler.with_particles(2 * num_particles)
-                more = exchanged(larger, keys[2], samples, so_far)
-                counts["log_marginal_likelihood"] += int(more.invalid)
+                with_larger, gain, _, dropped = exchanged(larger, keys[2], samples, so_far)
+                counts["log_marginal_likelihood"] += int(dropped)
                 # Where no filter of 2N particles has any likelihood, those of N are kept.
-                if float(more.increment) > -np.inf:
-                    samples, num_particles = more.samples, 2 * num_particles
-                    increment += float(more.increment)
+                if float(gain) > -np.inf:
+                    samples, num_particles = with_larger, 2 * num_particles
+                    increment += float(gain)
         row = (np.array([number]) for number in (increment, size, rate, num_particles))
         return step + 1, (samples, num_particles, counts), tuple(row)
 
 
-def _padded(series: Series, capacity: int) -> FilterOf:
-    """Runs over the data, in arrays with room for this many steps."""
+def _padded(series: Series, capacity: int) -> Series:
+    """The data in arrays of JAX with room for this many steps."""
 
     def pad(leaf: np.ndarray) -> Array:
         return jnp.asarray(np.resize(leaf, (capacity, *leaf.shape[1:])))
 
-    return FilterOf(jax.tree.map(pad, series))
+    return jax.tree.map(pad, series)

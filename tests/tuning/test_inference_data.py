@@ -34,30 +34,40 @@ def arviz(request, monkeypatch):
     monkeypatch.setitem(sys.modules, "arviz", module)
 
 
+def of_metropolis():
+    return Posterior(
+        parameters=PARAMETERS, log_marginal_likelihoods=ACCEPTED, accepted=ACCEPTED > 0.5
+    )
+
+
+def of_gibbs(states=STATES):
+    return GibbsPosterior(
+        parameters=PARAMETERS, trajectories=states, accepted=ACCEPTED, renewed=RENEWED
+    )
+
+
 def test_of_metropolis_hastings():
-    groups, dims, _ = to_inference_data(Posterior(PARAMETERS, ACCEPTED, ACCEPTED > 0.5))
+    groups, dims, _ = to_inference_data(of_metropolis())
     assert groups["posterior"] == PARAMETERS
     assert set(groups["sample_stats"]) == {"log_marginal_likelihood", "accepted"}
     assert dims == {}
 
 
 def test_of_particle_gibbs():
-    groups, dims, coords = to_inference_data(GibbsPosterior(PARAMETERS, STATES, ACCEPTED, RENEWED))
+    groups, dims, coords = to_inference_data(of_gibbs())
     assert set(groups["posterior"]) == {"a", "b", "state_position", "state_speed"}
     assert set(groups["sample_stats"]) == {"acceptance_rate", "renewed"}
     assert dims["state_position"] == ["time", "state_position_dim_1"]
     assert dims["state_speed"] == dims["renewed"] == ["time"]
     np.testing.assert_array_equal(coords["time"], np.arange(6))
-    first = GibbsPosterior(PARAMETERS, STATES["speed"][:, :, 0], ACCEPTED, RENEWED)
-    groups, dims, _ = to_inference_data(first)
+    groups, dims, _ = to_inference_data(of_gibbs(STATES["speed"][:, :, 0]))
     assert groups["posterior"]["state"].shape == (3, 50)
     assert set(dims) == {"renewed"}
 
 
 def test_of_what_comes_next():
     ahead = Predictive({"speed": RNG.normal(size=(3, 50, 4))}, RNG.normal(size=(3, 50, 4, 2)))
-    result = GibbsPosterior(PARAMETERS, STATES, ACCEPTED, RENEWED)
-    groups, dims, coords = to_inference_data(result, ahead)
+    groups, dims, coords = to_inference_data(of_gibbs(), ahead)
     assert set(groups["posterior_predictive"]) == {"observation", "state_ahead_speed"}
     assert dims["observation"] == ["ahead", "observation_dim_1"]
     assert coords["ahead"].tolist() == [1, 2, 3, 4]
@@ -89,4 +99,4 @@ def test_of_trajectories_and_of_nothing_else():
 def test_without_arviz_it_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "arviz", None)
     with pytest.raises(ImportError, match="pip install arviz"):
-        to_inference_data(Posterior(PARAMETERS, ACCEPTED, ACCEPTED > 0.5))
+        to_inference_data(of_metropolis())
