@@ -35,7 +35,8 @@ from tqdm import tqdm
 
 import mpfjax
 from mpfjax import console
-from mpfjax.console import exit_status, format_table, write_figure, write_json
+from mpfjax.console import exit_status, format_table, write_json
+from mpfjax.running.storage import write_whole
 
 ROOT = Path(__file__).resolve().parents[1]
 Z_95 = 1.959963984540054
@@ -320,6 +321,17 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Collection) and not isinstance(value, str):
         return [_plain(each) for each in value]
     return str(value) if isinstance(value, Path) else value
+
+
+def write_figure(path: Path, figure: Any, dpi: int = 150) -> None:
+    """Write a matplotlib figure as PNG, for pages, and beside it as PDF, for print."""
+    layout = figure.get_layout_engine()
+    for kind in ("png", "pdf"):
+        draw = partial(figure.savefig, format=kind, dpi=dpi)
+        write_whole(path.with_suffix(f".{kind}"), draw)
+        # The second picture has the places of the first: finding them takes as long as drawing.
+        figure.set_layout_engine("none")
+    figure.set_layout_engine(layout)
 
 
 def figures(out: Path, dpi: int = 150, **drawn: Any) -> None:

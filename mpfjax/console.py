@@ -13,7 +13,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,17 +44,6 @@ def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str], int]:
 seed = whole(0, 2**32 - 1)
 positive = _read_by(float, lambda number: 0 < number < math.inf, "a positive, finite number")
 finite = _read_by(float, math.isfinite, "a finite number")
-
-
-def write_figure(path: Path, figure: Any, dpi: int = 150) -> None:
-    """Write a matplotlib figure as PNG, for pages, and beside it as PDF, for print."""
-    layout = figure.get_layout_engine()
-    for kind in ("png", "pdf"):
-        draw = partial(figure.savefig, format=kind, dpi=dpi)
-        write_whole(path.with_suffix(f".{kind}"), draw)
-        # The second picture has the places of the first: finding them takes as long as drawing.
-        figure.set_layout_engine("none")
-    figure.set_layout_engine(layout)
 
 
 def write_json(path: Path, content: Any) -> None:

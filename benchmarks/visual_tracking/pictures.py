@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.figures import draw_contact_sheet, region
+from benchmarks.harness import write_figure
 from benchmarks.visual_tracking.source import Source
-from mpfjax.console import write_figure
 from mpfjax.vision.boxes.following import Snapshot, annotate
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import frames

@@ -87,7 +87,7 @@ def steps_of_inputs(
     if own_length != length:
         raise ValueError(f"inputs: their t is {own_length}, and that of the {of_what} is {length}")
     usable = _steps_where(arrays, "all", _USABLE[NOT_FINITE])
-    return _refused_where(~usable, arrays, f"inputs: {NOT_FINITE}")
+    return refused_where(~usable, arrays, f"inputs: {NOT_FINITE}")
 
 
 def one_input(inputs: PyTree, model: Any, in_time: bool = False) -> PyTree:
@@ -166,7 +166,7 @@ def present_steps(observations: PyTree, series: Series, refused: str) -> Any:
             _warn_of_parts(observations, present & ~usable)
         present = present & seen
     hint = "; Series.skipping(observations) takes them as missing" * (refused == NOT_FINITE)
-    present = _refused_where(present & ~usable, present, f"observations: {refused}", hint)
+    present = refused_where(present & ~usable, present, f"observations: {refused}", hint)
     return None if numpy is np and present.all() else jnp.asarray(present)
 
 
@@ -209,15 +209,16 @@ def _steps_where(arrays: PyTree, combine: str, holds: Callable[[Any, Any], Any])
     return getattr(numpy.stack(rows), combine)(axis=0)
 
 
-def _refused_where(broken: Any, tree: PyTree, fault: str, hint: str = "") -> PyTree:
-    """The tree; a `ValueError` that names the first broken step, if there is one.
+def refused_where(broken: Any, tree: PyTree, fault: str, hint: str = "") -> PyTree:
+    """The tree; a `ValueError` where it is broken, that names the first of several steps.
 
     Within a caller's jit no value can be named, and the check runs with the caller's program.
     """
     if isinstance(broken, Tracer):
         return eqx.error_if(tree, broken, fault)
     if broken.any():
-        raise ValueError(f"{fault} at index {int(np.argmax(broken))} of the leading axis{hint}")
+        at = f" at index {int(np.argmax(broken))} of the leading axis" if broken.ndim else ""
+        raise ValueError(f"{fault}{at}{hint}")
     return tree
 
 

@@ -149,9 +149,9 @@ def is_traced(tree: PyTree) -> bool:
 
 
 def jit_with_floats_traced(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """`jit_on_wide_vectors` of a function of a filter first, by `with_floats_traced`."""
+    """`jit_on_wide_vectors` of a function of filters or models, by `with_floats_traced`."""
     compiled = jit_on_wide_vectors(function)
-    return lambda filter, *rest: with_floats_traced(lambda own: compiled(own, *rest), filter)
+    return lambda *arguments: with_floats_traced(lambda own: compiled(*own), arguments)
 
 
 # The errors of JAX where Python asks for the value of a traced number.

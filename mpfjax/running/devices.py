@@ -52,24 +52,27 @@ def over_devices(
     run_on_one: Callable[..., PyTree],
     inputs: PyTree,
     arguments: tuple[PyTree, ...],
-    devices: list[Any] | None,
+    devices: int | Sequence[Any] | None,
+    choose: Callable[[Any], list[Any]] = choose_devices,
 ) -> PyTree:
     """`run(inputs, *arguments)` with the inputs dealt to the devices in blocks of equal size.
 
     Every leaf of the result has a leading axis k, like the inputs, and lies on the first device,
     or on the first one of each process. If the number of devices does not divide k, the last input
     is repeated, and the extra results are dropped. Devices exchange only what `run` makes them
-    exchange. `run_on_one` is compiled and does all runs on one device. With None, JAX chooses it.
+    exchange. `run_on_one` is compiled and does all runs on one device. Which devices there are is
+    left to `choose`, and in a program of the caller's, for None, to JAX.
     """
     traced = is_traced((inputs, arguments))
-    if devices is None or len(devices) == 1:
-        if not traced and devices not in (None, jax.devices()[:1]):
-            inputs, arguments = _placed((inputs, arguments), devices[0])
+    chosen = [] if traced and devices is None else choose(devices)
+    if len(chosen) < 2:
+        if not traced and chosen != jax.devices()[:1]:
+            inputs, arguments = _placed((inputs, arguments), chosen[0])
         return run_on_one(inputs, *arguments)
     num_inputs = length_of(inputs)
-    padding = -num_inputs % len(devices)
+    padding = -num_inputs % len(chosen)
     padded = _at(inputs, np.arange(num_inputs + padding)) if padding else inputs
-    mesh = Mesh(np.array(devices), (DEVICE_AXIS,))
+    mesh = Mesh(np.array(chosen), (DEVICE_AXIS,))
     if not traced:
         padded = _placed(padded, NamedSharding(mesh, P(DEVICE_AXIS)))
         arguments = _placed(arguments, NamedSharding(mesh, P()))
@@ -105,8 +108,7 @@ def _spread(run, inputs, arguments, mesh):
 
 def _placed(tree: PyTree, where: Any) -> PyTree:
     """Every array of the tree moved to a device or sharding."""
-    is_array = lambda leaf: isinstance(leaf, jax.Array | np.ndarray)  # noqa: E731
-    arrays, rest = eqx.partition(tree, is_array)
+    arrays, rest = eqx.partition(tree, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
     if jax.process_count() == 1:
         return eqx.combine(jax.device_put(arrays, where), rest)
     _require_same_everywhere(arrays)

@@ -5,6 +5,7 @@ Where their masses have become uneven, `IslandInteraction` deals the particles a
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import as_series
 from mpfjax.moves.base import AbstractMove, Step, is_missing
-from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.islands import (
     DEVICE_AXIS,
     ISLAND_AXIS,
@@ -72,10 +73,8 @@ def run_islands(
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
 
     def run(filter: Filter) -> FilterRun:
-        arguments = (filter, series, collect)
-        leave_to_caller = devices is None and is_traced((key, arguments))
-        chosen = None if leave_to_caller else _dividing(num_islands, devices)
-        return over_devices(_run_block, _run_on_one, keys, arguments, chosen)
+        arguments, dividing = (filter, series, collect), partial(_dividing, num_islands)
+        return over_devices(_run_block, _run_on_one, keys, arguments, devices, dividing)
 
     return sound(_joined(with_floats_traced(run, filter), collect is None))
 
@@ -91,14 +90,15 @@ def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any
 
 def _run_block(keys, filter, series, collect):
     """The islands of one device."""
-    run_one = lambda key: scan(key, filter, series, collect)  # noqa: E731
-    return jax.vmap(run_one, axis_name=ISLAND_AXIS)(keys)
+    return jax.vmap(lambda key: scan(key, filter, series, collect), axis_name=ISLAND_AXIS)(keys)
 
 
 @jit_on_wide_vectors
 def _run_on_one(keys, filter, series, collect):
-    run_block = lambda keys: _run_block(keys, filter, series, collect)  # noqa: E731
-    run = jax.vmap(run_block, axis_name=DEVICE_AXIS)(keys[None])
+    def on_device(keys: Key[Array, " islands"]) -> FilterRun:
+        return _run_block(keys, filter, series, collect)
+
+    run = jax.vmap(on_device, axis_name=DEVICE_AXIS)(keys[None])
     return jax.tree.map(lambda leaf: leaf[0], run)
 
 
@@ -124,7 +124,10 @@ def _whole_mixture(islands: ParticleMixture) -> ParticleMixture:
     """One mixture of the islands' particles, from fields with a leading axis of islands."""
     num_islands, num_components = islands.log_weights.shape[0], islands.num_components
     firsts = num_components * jnp.arange(num_islands, dtype=jnp.int32)
-    side_by_side = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
+
+    def side_by_side(leaf: Array) -> Array:
+        return leaf.reshape(-1, *leaf.shape[2:])
+
     return ParticleMixture(
         particles=jax.tree.map(side_by_side, islands.particles),
         log_weights=side_by_side(islands.log_weights),

@@ -13,7 +13,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import as_series
 from mpfjax.moves.eve_indices import EVE_INDICES, with_new_eve_indices
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
-from mpfjax.running.devices import choose_devices, num_processors, over_devices, over_threads
+from mpfjax.running.devices import num_processors, over_devices, over_threads
 from mpfjax.running.scan import FilterRun, first_mixture, initial_keys, scan, sound, told_of_start
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
@@ -54,8 +54,8 @@ def run_filter(
     or densities have the wrong shape or type, and RuntimeError if its densities give NaN.
     """
     series = as_series(observations, filter.model, inputs, missing)
-    run = lambda filter: _run(key, filter, series, collect)  # noqa: E731
-    return told_of_start(sound(with_floats_traced(run, filter)), filter)
+    run = with_floats_traced(lambda own: _run(key, own, series, collect), filter)
+    return told_of_start(sound(run), filter)
 
 
 @checked
@@ -101,9 +101,7 @@ def monte_carlo(
             starts = (keys, _start_each(keys, filter, series, int(slots)))
             filter = filter.replace(num_particles=int(slots))
         arguments = (filter, series, collect)
-        leave_to_caller = devices is None and is_traced((starts, arguments))
-        chosen = None if leave_to_caller else choose_devices(devices)
-        return over_devices(_run_each, _run_on_threads, starts, arguments, chosen)
+        return over_devices(_run_each, _run_on_threads, starts, arguments, devices)
 
     return told_of_start(sound(with_floats_traced(run, filter)), filter)
 
@@ -135,8 +133,10 @@ def _start_each(keys, filter, series, slots):
 def _run_each(starts, filter, series, collect):
     num_runs = starts[0].shape[0]
     size = _group_size(num_runs, filter)
-    run = lambda key, initial: scan(key, filter, series, collect, initial)  # noqa: E731
-    run_together = lambda starts: jax.vmap(run)(*starts)  # noqa: E731
+
+    def run_together(starts: PyTree) -> FilterRun:
+        return jax.vmap(lambda key, initial: scan(key, filter, series, collect, initial))(*starts)
+
     if size == num_runs:
         return run_together(starts)
     in_groups = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), starts)

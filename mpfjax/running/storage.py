@@ -218,7 +218,10 @@ def _static_fields(tree: PyTree, place: tuple[Any, ...]) -> dict[str, str]:
         for field in dataclasses.fields(tree):
             if field.metadata.get("static", False):
                 found[f"{start}.{field.name}"] = named(getattr(tree, field.name, None))
-    is_inner = lambda node: node is not tree and isinstance(node, eqx.Module)  # noqa: E731
+
+    def is_inner(node: Any) -> bool:
+        return node is not tree and isinstance(node, eqx.Module)
+
     for inner, node in jax.tree_util.tree_leaves_with_path(tree, is_leaf=is_inner):
         if is_inner(node):
             found |= _static_fields(node, place + inner)

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import real_each, with_inputs
+from mpfjax.models.base import with_inputs
+from mpfjax.models.steps import log_transition
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.prefix_sums import (
@@ -71,6 +72,11 @@ def draw_ends(
     return indices, jax.tree.map(lambda leaf: take(leaf, indices), final.particles)
 
 
+def ended(rows: PyTree, row: PyTree) -> PyTree:
+    """The rows of the times before, and that of the end."""
+    return jax.tree.map(lambda before, end: jnp.concatenate([before, end[None]]), rows, row)
+
+
 def log_kernel_from(
     model: Any, mixture: ParticleMixture
 ) -> Callable[[tuple[PyTree, Bool[Array, ""]]], Array]:
@@ -83,8 +89,7 @@ def log_kernel_from(
     def log_density(future: tuple[PyTree, Bool[Array, ""]]) -> Float[Array, " n"]:
         state, began_anew = future
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), state)
-        values = model.log_transition(copies, mixture.particles)
-        values = real_each(values, n, model, "log_transition")
+        values = log_transition(model, copies, mixture.particles)
         return jnp.where(began_anew, jnp.zeros_like(values), values)
 
     return log_density
@@ -144,13 +149,10 @@ def walk(
     O(1) for a state and step; the index after each of the steps. `proposed` are draws by
     the weights alone, which can all be made beforehand.
     """
-    num_states = start.shape[0]
 
     def log_density(indices: Int[Array, " k"]) -> Float[Array, " k"]:
         previous = jax.tree.map(lambda leaf: take(leaf, indices), mixture.particles)
-        values = model.log_transition(next_states, previous)
-        real_each(values, num_states, model, "log_transition")
-        return values
+        return log_transition(model, next_states, previous)
 
     def move(
         place: tuple[Int[Array, " k"], Float[Array, " k"]],
@@ -171,10 +173,8 @@ def walk(
 
 def log_transitions(model: Any, trajectory: PyTree, inputs: PyTree) -> Float[Array, " t"]:
     """log D(x_s | x_{s-1}) at every step of one trajectory, leaves (t + 1, ...)."""
-    before, after = (
-        jax.tree.map(lambda leaf, cut=cut: leaf[cut], trajectory)
-        for cut in (slice(None, -1), slice(1, None))
-    )
+    before = jax.tree.map(lambda leaf: leaf[:-1], trajectory)
+    after = jax.tree.map(lambda leaf: leaf[1:], trajectory)
     if inputs is None:
         return model.log_transition(after, before)
 

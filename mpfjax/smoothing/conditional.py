@@ -6,17 +6,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import checked, kinds
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.models.observations import Series, as_arrays, as_series
+from mpfjax.models.observations import Series, as_arrays, as_series, refused_where
 from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
 from mpfjax.moves.initial import sample_initial
-from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.random import split, uniform
 from mpfjax.running.scan import FilterRun, initial_keys, scan, sound
 from mpfjax.smoothing.backward import draw, log_transitions
@@ -92,21 +91,11 @@ def conditional_filter(
     series = as_series(observations, filter.model)
     trajectory = _as_states(trajectory, filter.model, series.length + 1)
     # Checked before the run: backward sampling could not recover an impossible trajectory.
-    _require(eqx.filter_jit(possible_times)(filter.model, trajectory, series.inputs))
-    run = lambda filter: _run(key, filter, series, trajectory, backward)  # noqa: E731
-    found = with_floats_traced(run, filter)
+    possible = eqx.filter_jit(possible_times)(filter.model, trajectory, series.inputs)
+    trajectory = refused_where(~possible, trajectory, _IMPOSSIBLE)
+    found = _run(key, filter, series, trajectory, backward)
     found = eqx.tree_at(lambda found: found.run, found, sound(found.run, free=False))
-    if isinstance(found.possible, Tracer):
-        return eqx.error_if(found, ~jnp.all(found.possible), _IMPOSSIBLE)
-    _require(found.possible)
-    return found
-
-
-def _require(possible: Bool[Array, " t"]) -> None:
-    """Raise a `ValueError` that names the first time at which the trajectory is impossible."""
-    if not isinstance(possible, Tracer) and not np.all(possible):
-        first = int(np.argmin(np.asarray(possible)))
-        raise ValueError(f"{_IMPOSSIBLE}, first at index {first} of its times")
+    return refused_where(~found.possible, found, _IMPOSSIBLE)
 
 
 def renew(
@@ -148,7 +137,7 @@ def renew(
     )
 
 
-_run = jit_on_wide_vectors(renew)
+_run = jit_with_floats_traced(renew)
 
 
 def draw_trajectory(
@@ -197,7 +186,10 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
 def shape_of_trajectory(model: Any, length: int) -> PyTree:
     """The shapes and types of x_0, ..., x_t of a model, t + 1 being the length."""
     states = jax.eval_shape(lambda key: sample_initial(key, model, 1), jax.random.key(0))
-    in_time = lambda leaf: jax.ShapeDtypeStruct((length, *leaf.shape[1:]), leaf.dtype)  # noqa: E731
+
+    def in_time(leaf: Any) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((length, *leaf.shape[1:]), leaf.dtype)
+
     return jax.tree.map(in_time, states)
 
 

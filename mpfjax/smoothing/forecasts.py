@@ -12,7 +12,7 @@ from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, mapped, with_inputs
 from mpfjax.models.observations import steps_of_inputs
-from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.compiling import jit_with_floats_traced
 
 
 class Forecast(eqx.Module):
@@ -61,13 +61,10 @@ def forecast(
     """
     simulate = mapped(filter.model, simulate_observation, draws=True)
     inputs = steps_of_inputs(inputs, num_steps, filter.model, "forecast")
-    options = (num_steps, simulate)
-    return with_floats_traced(
-        lambda filter: _forecast(key, filter, mixture, inputs, options), filter
-    )
+    return _forecast(key, filter, mixture, inputs, num_steps, simulate)
 
 
-def given(simulate_observation: Any, inputs: PyTree) -> Any:
+def _given(simulate_observation: Any, inputs: PyTree) -> Any:
     """The function at a step with these inputs, which every model in it receives."""
 
     def is_model(node: Any) -> bool:
@@ -79,10 +76,8 @@ def given(simulate_observation: Any, inputs: PyTree) -> Any:
     return jax.tree.map(give, simulate_observation, is_leaf=is_model)
 
 
-@jit_on_wide_vectors
-def _forecast(key, filter, mixture, inputs, options):
-    num_steps, simulate_observation = options
-
+@jit_with_floats_traced
+def _forecast(key, filter, mixture, inputs, num_steps, simulate_observation):
     def advance(
         mixture: ParticleMixture, step: tuple[Array, PyTree]
     ) -> tuple[ParticleMixture, Any]:
@@ -91,7 +86,7 @@ def _forecast(key, filter, mixture, inputs, options):
         mixture, _ = filter.with_inputs(now)._step(key_step, mixture)
         observations = None
         if simulate_observation is not None:
-            simulate = given(simulate_observation, now)
+            simulate = _given(simulate_observation, now)
             with saying("simulate_observation", "called with a key and the particles"):
                 observations = simulate(key_observation, mixture.particles)
             check_one_each(mixture.num_particles, simulate_observation=observations)

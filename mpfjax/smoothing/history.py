@@ -5,11 +5,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mpfjax.checks import checked
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.observations import refused_where
 from mpfjax.operations.stored import count_places, take
 from mpfjax.running.scan import FilterRun
 
@@ -44,18 +44,7 @@ def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:
     """The mixtures; an error where a particle comes from no single one of the step before."""
     is_orphan = (mixtures.ancestor_indices < 0) & (mixtures.log_weights > -jnp.inf)
     what = "follows ancestors, and particles of index -1 have no single one, as after restarts"
-    return refused_where(jnp.any(is_orphan[1:]), f"mixtures: {needed_by} {what}", mixtures)
-
-
-def refused_where(
-    is_wrong: Bool[Array, ""], message: str, mixtures: ParticleMixture
-) -> ParticleMixture:
-    """The mixtures; a `ValueError` where they are wrong, or a RuntimeError within jit."""
-    if isinstance(is_wrong, Tracer):
-        return eqx.error_if(mixtures, is_wrong, message)
-    if is_wrong:
-        raise ValueError(message)
-    return mixtures
+    return refused_where(jnp.any(is_orphan[1:]), mixtures, f"mixtures: {needed_by} {what}")
 
 
 def ancestors_of(particles: Int[Array, " k"], mixtures: ParticleMixture) -> Int[Array, "t k"]:
@@ -71,8 +60,11 @@ def ancestors_of(particles: Int[Array, " k"], mixtures: ParticleMixture) -> Int[
 
 def paths_through(mixtures: ParticleMixture, indices: Int[Array, "t k"]) -> PyTree:
     """The states in these slots, leaves (k, t, ...)."""
-    states = lambda leaf: jnp.moveaxis(jax.vmap(take)(leaf, indices), 0, 1)  # noqa: E731
-    return jax.tree.map(states, mixtures.particles)
+
+    def states(mixture: ParticleMixture, slots: Int[Array, " k"]) -> PyTree:
+        return jax.tree.map(lambda leaf: take(leaf, slots), mixture.particles)
+
+    return jax.vmap(states, out_axes=1)(mixtures, indices)
 
 
 class Genealogy(eqx.Module):

@@ -48,12 +48,13 @@ from mpfjax.models.gaussians import (
     transposed,
     without_missing,
 )
+from mpfjax.models.observations import refused_where
 from mpfjax.models.steps import log_transition
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
-from mpfjax.smoothing.backward import draw_ends, draw_exactly
-from mpfjax.smoothing.history import refused_where, starts_of
+from mpfjax.smoothing.backward import draw_ends, draw_exactly, ended
+from mpfjax.smoothing.history import starts_of
 
 
 class Information(NamedTuple):
@@ -75,7 +76,7 @@ def check_marginalised(
     if lengths != {num_steps}:
         raise ValueError(f"observations: {sorted(lengths)} steps, not {num_steps}, from x_0 on")
     message = "mixtures: a state that began anew, as with restarts, has moments of its own"
-    return refused_where(jnp.any(starts_of(mixtures)), message, mixtures)
+    return refused_where(jnp.any(starts_of(mixtures)), mixtures, message)
 
 
 @jit_on_wide_vectors
@@ -108,8 +109,7 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     earlier = jax.tree.map(lambda leaf: leaf[:-1], mixtures)
     steps = (jax.random.split(key_steps, length), earlier, observations, inputs)
     _, past = jax.lax.scan(back, (end.latent, nothing), steps, reverse=True)
-    ended = lambda rows, row: jnp.concatenate([rows, row[None]])  # noqa: E731
-    latents, futures, indices = jax.tree.map(ended, past, (end.latent, nothing, last))
+    latents, futures, indices = ended(past, (end.latent, nothing, last))
     following = jax.tree.map(lambda leaf: leaf[1:], latents)
     start = with_moments(model, jax.tree.map(lambda leaf: leaf[0], latents))
     _, later = jax.lax.scan(forth, start, (following, observations, inputs))

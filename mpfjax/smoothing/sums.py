@@ -15,23 +15,12 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require, with_inputs
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.observations import as_series, one_input, one_observation
-from mpfjax.operations.compiling import (
-    jit_on_wide_vectors,
-    jit_with_floats_traced,
-    with_floats_traced,
-)
+from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.logarithms import as_inexact
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
 from mpfjax.report import StepInfo
-from mpfjax.running.scan import (
-    FilterRun,
-    first_mixture,
-    report_of,
-    run_of,
-    sound,
-    step_or_predict,
-)
+from mpfjax.running.scan import FilterRun, first_mixture, report_of, run_of, sound, step_or_predict
 from mpfjax.smoothing.backward import draw, draw_exactly, log_kernel_from, walk
 
 
@@ -94,12 +83,11 @@ def smoothed_sums(
     if lag is not None:
         lag = min(lag, series.length - 1)
     smoother = FixedLagSmoother(filter, function, lag or 0, method, num_draws)
-    smooth = lambda smoother: _smooth(key, smoother, series, lag)  # noqa: E731
-    sums = with_floats_traced(smooth, smoother)
+    sums = _smooth(key, smoother, series, lag)
     return eqx.tree_at(lambda sums: sums.run, sums, sound(sums.run))
 
 
-@jit_on_wide_vectors
+@jit_with_floats_traced
 def _smooth(key, smoother, series, lag):
     # The first two are those of `run_filter`.
     key_initial, key_steps, key_backward = split(key, 3)

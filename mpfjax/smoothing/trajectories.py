@@ -10,18 +10,14 @@ from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.checks import Count, CountOrZero, checked, warn
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import (
-    AbstractStateSpaceModel,
-    require,
-    with_inputs,
-)
+from mpfjax.models.base import AbstractStateSpaceModel, require, with_inputs
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
 from mpfjax.models.observations import as_arrays, gathered, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
 from mpfjax.running.scan import FilterRun
-from mpfjax.smoothing.backward import draw, draw_ends, draw_exactly, log_kernel_from, walk
+from mpfjax.smoothing.backward import draw, draw_ends, draw_exactly, ended, log_kernel_from, walk
 from mpfjax.smoothing.history import mixtures_of, starts_of, with_parents
 from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
@@ -145,9 +141,7 @@ def draw_trajectories(
     keys = jax.random.split(key_steps, num_earlier)
     steps = (keys, earlier, ancestors, starts_of(mixtures)[1:], proposed, inputs)
     _, past = jax.lax.scan(back, (states, last), steps, reverse=True)
-    states, indices = jax.tree.map(
-        lambda before, end: jnp.concatenate([before, end[None]]), past, (states, last)
-    )
+    states, indices = ended(past, (states, last))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states), indices
 
 

@@ -1,7 +1,7 @@
 """Standard errors of log Ẑ, masses and means: from one run by first ancestors, or from a batch."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -58,8 +58,11 @@ def with_first_ancestors(filter: Filter) -> Filter:
         if move.approximate or not move.keeps_families:
             name = type(move).__name__
             raise ValueError(f"filter: {name} is approximate or draws in a way of its own")
+
     # Draws that are more even than independent ones are not what the formulae are made of.
-    draws = lambda node: hasattr(node, "scheme") or hasattr(node, "noise")  # noqa: E731
+    def draws(node: Any) -> bool:
+        return hasattr(node, "scheme") or hasattr(node, "noise")
+
     for part in [filter, *jax.tree.leaves(filter.moves, is_leaf=draws)]:
         for option, known in _INDEPENDENT.items():
             chosen, name = getattr(part, option, known), type(part).__name__

@@ -136,7 +136,7 @@ def test_one_particle_none_seen_and_no_log_transition():
     ],
 )
 def test_a_trajectory_of_density_zero_is_named(trajectory, index):
-    with pytest.raises(ValueError, match=f"trajectory: .*zero or NaN, first at index {index}"):
+    with pytest.raises(ValueError, match=f"trajectory: .*zero or NaN at index {index}"):
         call(trajectory)
     if index == 2:
         with pytest.raises(RuntimeError, match=r"zero or NaN|log_transition is -inf"):
