@@ -147,40 +147,28 @@ def gospa(
     )
 
 
-def _paired(
-    estimates: Any, truths: Any, cutoff: float, order: float, estimate_mask: Any, truth_mask: Any,
-    base_distance: Callable[[Array, Array], Array],
-) -> _Pairing:  # fmt: skip
-    """The cheapest pairing of the two sets; a `ValueError` for sets that will not do."""
-    estimates = real_array("number d", "estimates", estimates)
-    truths = real_array("number d", "truths", truths)
-    is_estimate = _mask("estimate_mask", estimate_mask, estimates.shape[0])
-    is_truth = _mask("truth_mask", truth_mask, truths.shape[0])
-    distances = base_distance(estimates, truths) / cutoff
-    return _cheapest_pairing(distances, is_estimate, is_truth, order)
-
-
 # Costs below this share of the largest are lost in the sums of the search.
 _FINE = 1e-3
 
 
-def _cheapest_pairing(
-    distances: Float[Array, "k l"],
-    is_estimate: Bool[Array, " k"],
-    is_truth: Bool[Array, " l"],
-    order: float,
-) -> _Pairing:
-    """Pair as many entries as possible, in a square matrix whose other entries are not there.
+def _paired(
+    estimates: Any, truths: Any, cutoff: float, order: float, estimate_mask: Any, truth_mask: Any,
+    base_distance: Callable[[Array, Array], Array],
+) -> _Pairing:  # fmt: skip
+    """The cheapest pairing of the two sets; a `ValueError` for sets that will not do.
 
-    The search is repeated with the largest distance that it found below the cutoff as the unit, in
+    It pairs as many entries as possible, in a square matrix whose other entries are not there. The
+    search is repeated with the largest distance that it found below the cutoff as the unit, in
     which the powers of those that compete are numbers that it can add. An entry alone, or one of
     more than all of these together, costs `most`: how much more makes no difference.
     """
-    num_estimates, num_truths = distances.shape
-    size = max(num_estimates, num_truths)
-    rows, columns = (0, size - num_estimates), (0, size - num_truths)
-    is_estimate = jnp.pad(is_estimate, rows)
-    is_truth = jnp.pad(is_truth, columns)
+    estimates = real_array("number d", "estimates", estimates)
+    truths = real_array("number d", "truths", truths)
+    size = max(len(estimates), len(truths))
+    rows, columns = (0, size - len(estimates)), (0, size - len(truths))
+    is_estimate = jnp.pad(_mask("estimate_mask", estimate_mask, len(estimates)), rows)
+    is_truth = jnp.pad(_mask("truth_mask", truth_mask, len(truths)), columns)
+    distances = base_distance(estimates, truths) / cutoff
     is_pair, is_alone = is_estimate[:, None] & is_truth[None], is_estimate[:, None] ^ is_truth[None]
     capped = jnp.where(is_pair, jnp.pad(jnp.minimum(distances, 1.0), (rows, columns)), 0.0)
     # The search for the pairing would not end on a NaN, so it never sees one.

@@ -146,10 +146,7 @@ def _gathered(tree: PyTree, mesh: Mesh) -> PyTree:
 
 
 def over_threads(
-    run: Callable[..., PyTree],
-    inputs: PyTree,
-    arguments: tuple[PyTree, ...],
-    num_threads: int,
+    run: Callable[..., PyTree], inputs: PyTree, arguments: tuple[PyTree, ...], num_threads: int
 ) -> PyTree:
     """`run(inputs, *arguments)`, compiled, with the inputs distributed over threads.
 

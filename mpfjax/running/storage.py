@@ -278,9 +278,7 @@ def write_described(
     write_whole(path, lambda file: np.savez(file, **content))
 
 
-def read_described(
-    path: str | os.PathLike[str],
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_described(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the description that `write_described` wrote; `ValueError` for other files."""
     with open(path, "rb") as file:
         try:

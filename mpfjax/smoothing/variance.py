@@ -167,16 +167,19 @@ def _with_lineage(run: FilterRun | ParticleMixture) -> ParticleMixture:
 
 
 class BatchEstimate(NamedTuple):
-    """Estimates from a batch of runs, with their standard errors."""
+    """Estimates from a batch of runs, with their standard errors.
+
+    - `value` and `error`: the expectation, and its standard error.
+    - `log_marginal_likelihood` and `log_marginal_likelihood_error`: log of the mean of Ẑ.
+    - `effective_runs`: (Σ Ẑ)² / Σ Ẑ²: below about a third of the runs, errors are too small
+      themselves.
+    """
 
     value: Float[Array, " *shape"]
     error: Float[Array, " *shape"]
-    """the standard error of `value`."""
     log_marginal_likelihood: Float[Array, ""]
-    """log of the mean of Ẑ."""
     log_marginal_likelihood_error: Float[Array, ""]
     effective_runs: Float[Array, ""]
-    """(Σ Ẑ)² / Σ Ẑ²: below about a third of the runs, errors are too small themselves."""
 
 
 @checked

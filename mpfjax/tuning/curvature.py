@@ -109,48 +109,38 @@ def _informations(
     # its seeds.
     sizes = np.sqrt(np.mean(score(centre) ** 2, axis=0))
     shortest = _FEWEST_PLACES * np.asarray(np.spacing(np.abs(centre)), float)
-    columns = []
-    for axis, size in enumerate(sizes):
-        first = 1 / size if 0 < size < np.inf else 1.0
-        columns.append(_column(score, centre, axis, first, shortest[axis], longest[axis]))
-    matrices = np.stack(columns, axis=2)
+
+    def column(axis: int) -> Float[np.ndarray, "seeds d"]:
+        """That of every seed, by differences over about one standard error.
+
+        So far the likelihood tells the points apart, and the noise matters least.
+        """
+        size, least, most = sizes[axis], shortest[axis], longest[axis]
+        step = float(np.clip(1 / size if 0 < size < np.inf else 1.0, least, most))
+        for _ in range(_MOST_ROUNDS):
+            below, above = centre.copy(), centre.copy()
+            below[axis] -= step
+            above[axis] += step
+            # Over the actual distance of the two points, after rounding.
+            slopes = (score(below) - score(above)) / (float(above[axis]) - float(below[axis]))
+            # Twice the loss of a step in nats, for a parabola.
+            told = abs(slopes[:, axis].mean()) * step**2
+            if not np.isfinite(slopes).all():
+                # Outside the model's domain.
+                most, following = step / 2, step / 8
+            elif _NEAR[0] <= told <= _NEAR[1]:
+                break
+            else:
+                factor = _FURTHEST_ROUND if told == 0 else 1 / np.sqrt(told)
+                following = step * np.clip(factor, 1 / _FURTHEST_ROUND, _FURTHEST_ROUND)
+            following = float(np.clip(following, least, max(least, most)))
+            if following == step:
+                break
+            step = following
+        return slopes
+
+    matrices = np.stack([column(axis) for axis in range(len(sizes))], axis=2)
     return (matrices + matrices.transpose(0, 2, 1)) / 2
-
-
-def _column(
-    score: Callable[[np.ndarray], np.ndarray],
-    centre: np.ndarray,
-    axis: int,
-    first: float,
-    shortest: float,
-    longest: float,
-) -> Float[np.ndarray, "seeds d"]:
-    """One column of every seed's information, by differences over about one standard error.
-
-    So far the likelihood tells the points apart, and the noise matters least.
-    """
-    step = float(np.clip(first, shortest, longest))
-    for _ in range(_MOST_ROUNDS):
-        below, above = centre.copy(), centre.copy()
-        below[axis] -= step
-        above[axis] += step
-        # Over the actual distance of the two points, after rounding.
-        column = (score(below) - score(above)) / (float(above[axis]) - float(below[axis]))
-        # Twice the loss of a step in nats, for a parabola.
-        told = abs(column[:, axis].mean()) * step**2
-        if not np.isfinite(column).all():
-            # Outside the model's domain.
-            longest, following = step / 2, step / 8
-        elif _NEAR[0] <= told <= _NEAR[1]:
-            break
-        else:
-            factor = _FURTHEST_ROUND if told == 0 else 1 / np.sqrt(told)
-            following = step * np.clip(factor, 1 / _FURTHEST_ROUND, _FURTHEST_ROUND)
-        following = float(np.clip(following, shortest, max(shortest, longest)))
-        if following == step:
-            break
-        step = following
-    return column
 
 
 def _inverse(information: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"] | None:

@@ -49,10 +49,7 @@ class LogEvidence(eqx.Module):
 
 
 def pose_evidence(
-    filter: Filter,
-    observations: PyTree,
-    parameters: Parameters,
-    transforms: Transforms,
+    filter: Filter, observations: PyTree, parameters: Parameters, transforms: Transforms
 ) -> Problem:
     """The problem of the log marginal likelihood; without `parameters`, in those of the model."""
     sequences = observations if isinstance(observations, list) else [observations]

@@ -36,11 +36,7 @@ class Predictive(NamedTuple):
 
 @checked
 def posterior_predictive(
-    key: Key[Array, ""],
-    posterior: Chains,
-    num_steps: Count,
-    *,
-    inputs: PyTree = None,
+    key: Key[Array, ""], posterior: Chains, num_steps: Count, *, inputs: PyTree = None
 ) -> Predictive:
     """Draw the next k states and observations given y_1..y_t, parameters and states integrated out.
 

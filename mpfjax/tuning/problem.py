@@ -140,10 +140,7 @@ def score_of_each(
 
 
 def pose(
-    tree: PyTree,
-    objective: Objective,
-    parameters: Parameters,
-    transforms: Transforms,
+    tree: PyTree, objective: Objective, parameters: Parameters, transforms: Transforms
 ) -> Problem:
     """The problem; a `ValueError` for arguments that do not make one."""
     leaves, structure = jax.tree.flatten(tree)
