@@ -1,11 +1,9 @@
 """Pictures of a run: its components over time. Only here matplotlib is used."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
@@ -45,9 +43,15 @@ def draw_components(
     """
     if mixtures.log_weights.ndim != 2:
         raise ValueError("mixtures: these are not all of one run; keep them by collect=None")
-    masses, means, variances = map(
-        np.asarray, jax.vmap(partial(_moments, periods=periods))(mixtures)
-    )
+
+    def moments(mixture: ParticleMixture) -> tuple[Array, Array, Array]:
+        means = flatten_states(mixture.component_means(periods))
+        covariances = mixture.component_covariances(periods)
+        # Rounding may leave a variance of zero slightly negative.
+        variances = jnp.maximum(covariances.diagonal(axis1=1, axis2=2), 0.0)
+        return mixture.mixture_weights, means, variances
+
+    masses, means, variances = map(np.asarray, jax.vmap(moments)(mixtures))
     if index >= means.shape[2]:
         raise ValueError(f"index: {shown(index)} of a state of {means.shape[2]} numbers")
     figure = Figure(figsize=(7.0, 3.4), layout="constrained")
@@ -76,14 +80,3 @@ def draw_components(
         if handle is not None:
             handle.set_alpha(1.0)
     return figure
-
-
-def _moments(
-    mixture: ParticleMixture, periods: PyTree
-) -> tuple[Float[Array, " m"], Float[Array, "m d"], Float[Array, "m d"]]:
-    """Masses, means and variances of the components."""
-    means = flatten_states(mixture.component_means(periods))
-    covariances = mixture.component_covariances(periods)
-    # Rounding may leave a variance of zero slightly negative.
-    variances = jnp.maximum(covariances.diagonal(axis1=1, axis2=2), 0.0)
-    return mixture.mixture_weights, means, variances

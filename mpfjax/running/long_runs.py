@@ -118,7 +118,7 @@ class LongRun:
         rows = _joined(pieces)
         if self.checkpoint is not None:
             arrays = arrays_of({"carry": state.carry, "rows": rows})
-            notes = {"step": state.step, "identity": self._described(state.step)}
+            notes = {"step": state.step, "identity": self.identity(state.step)}
             write_described(self.checkpoint.path, arrays, notes)
         return rows
 
@@ -129,20 +129,16 @@ class LongRun:
         path = self.checkpoint.path
         arrays, notes = read_described(path)
         step, found = notes.get("step", 0), notes.get("identity", {})
-        own = self._described(step)
+        own = self.identity(step)
         if found != own:
             said = differences(found, own)
             raise ValueError(f"checkpoint: {path} is of another {self.caller}: {said}")
         held = filled(path, arrays, {"carry": like.carry, "rows": like.rows})
         return State(step, held["carry"], held["rows"])
 
-    def _described(self, step: int) -> dict[str, str]:
-        """All that has to be the same for a file to be of this run, up to a step."""
-        return {"caller": self.caller, **self.identity(step)}
-
 
 def identity_of(
-    checkpoint: Checkpoint | None, settings: Mapping[str, Any], functions: Mapping[str, Any]
+    caller: str, checkpoint: Checkpoint | None, settings: dict[str, Any], functions: dict[str, Any]
 ) -> dict[str, str]:
     """All that has to be the same for a file to belong to this run, as text.
 
@@ -151,7 +147,7 @@ def identity_of(
     """
     if checkpoint is None:
         return {}
-    told = described(**settings)
+    told = {"caller": caller} | described(**settings)
     if checkpoint.name is not None:
         return told | {"name": checkpoint.name}
     programs = {part: program_of(*call) for part, call in functions.items() if call[0] is not None}

@@ -18,23 +18,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.mixture import MarginalisedState, ParticleMixture
+from mpfjax.models import conditionally_linear as linear
 from mpfjax.models import gaussians
 from mpfjax.models.base import with_inputs
-from mpfjax.models.conditionally_linear import (
-    decorrelated,
-    dynamics_of,
-    emission_of,
-    gaussian_of,
-    is_marginalised,
-    is_mixed,
-    latent_dynamics_of,
-    latent_rows,
-    observation_rows,
-    predicted,
-    predicted_gaussian,
-    updated,
-    with_moments,
-)
 from mpfjax.models.gaussians import (
     Gaussian,
     Linear,
@@ -69,7 +55,7 @@ def check_marginalised(
     model: Any, mixtures: ParticleMixture, observations: Any, method: str
 ) -> ParticleMixture:
     """The mixtures; a `ValueError` for restarts, and for data that backward sampling cannot use."""
-    if not is_marginalised(model) or observations is None or method != "exact":
+    if not linear.is_marginalised(model) or observations is None or method != "exact":
         raise ValueError("observations, method: y is for conditionally linear models, by 'exact'")
     lengths = {jnp.shape(leaf)[0] for leaf in jax.tree.leaves(observations)}
     num_steps = mixtures.log_weights.shape[0] - 1
@@ -102,7 +88,7 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     def forth(state: MarginalisedState, step: Any) -> tuple[Any, Any]:
         latent, observation, now = step
         moved_by = with_inputs(model, now)
-        state, _ = updated(moved_by, observation, predicted(moved_by, latent, state))
+        state, _ = linear.updated(moved_by, observation, linear.predicted(moved_by, latent, state))
         return state, state
 
     nothing = _nothing(end.mean)
@@ -111,7 +97,7 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     _, past = jax.lax.scan(back, (end.latent, nothing), steps, reverse=True)
     latents, futures, indices = ended(past, (end.latent, nothing, last))
     following = jax.tree.map(lambda leaf: leaf[1:], latents)
-    start = with_moments(model, jax.tree.map(lambda leaf: leaf[0], latents))
+    start = linear.with_moments(model, jax.tree.map(lambda leaf: leaf[0], latents))
     _, later = jax.lax.scan(forth, start, (following, observations, inputs))
     filtered = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows]), start, later)
     found = jax.vmap(_smoothed)(filtered, futures)
@@ -150,21 +136,21 @@ def _before(
     model: Any, observation: PyTree, latent: PyTree, before: MarginalisedState, future: Information
 ) -> Information:
     """The likelihood of y_{s+1}, z_{s+1} and all that follows as a function of x_s, given z_s."""
-    dynamics, law = dynamics_of(model, latent, before), gaussian_of(before)
+    dynamics, law = linear.dynamics_of(model, latent, before), linear.gaussian_of(before)
     told = _nothing(before.mean)
-    if is_mixed(model):
-        mixed, shared = latent_dynamics_of(model, before)
-        rows = latent_rows(model, latent)
+    if linear.is_mixed(model):
+        mixed, shared = linear.latent_dynamics_of(model, before)
+        rows = linear.latent_rows(model, latent)
         told = _told(rows, mixed, law)
-        dynamics = decorrelated(dynamics, mixed, shared, rows)
-    seen = emission_of(model, latent, before)
+        dynamics = linear.decorrelated(dynamics, mixed, shared, rows)
+    seen = linear.emission_of(model, latent, before)
     if seen is not None:
-        target = observation_rows(model, observation, seen, before.mean.dtype)
+        target = linear.observation_rows(model, observation, seen, before.mean.dtype)
         target, seen, _ = without_missing(target, seen)
         through = gaussians.through(dynamics, seen)
         told = _joined(told, _told(target, through, law))
         shared = product(dynamics.noise, transposed(seen.matrix))
-        dynamics = decorrelated(dynamics, through, shared, target)
+        dynamics = linear.decorrelated(dynamics, through, shared, target)
     matrix, offset, noise = dynamics
     precision, vector, centre = future
     offset = offset + applied(matrix, law.mean) - centre
@@ -214,11 +200,11 @@ def _indices(
     def log_density(trajectory: tuple) -> Float[Array, " n"]:
         own, *of_future = trajectory
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), own)
-        law = predicted_gaussian(model, copies, state)
+        law = linear.predicted_gaussian(model, copies, state)
         log_density = log_transition(model, copies, state)
-        seen = emission_of(model, copies, state)
+        seen = linear.emission_of(model, copies, state)
         if seen is not None:
-            rows = observation_rows(model, observation, seen, state.mean.dtype)
+            rows = linear.observation_rows(model, observation, seen, state.mean.dtype)
             law, log_factor = gaussians.update(law, rows, seen)
             log_density = log_density + log_factor
         one = Information(*(part[..., None] for part in of_future))
@@ -230,7 +216,7 @@ def _indices(
 
 def _smoothed(state: MarginalisedState, future: Information) -> MarginalisedState:
     """The moments of x_s given y_1..y_s and the likelihood of the future."""
-    n, law = state.mean.shape[0], gaussian_of(state)
+    n, law = state.mean.shape[0], linear.gaussian_of(state)
     root = cholesky(law.covariance)
     factor = _one_plus(future.precision, root)
     half = solve_lower(factor, transposed(root))

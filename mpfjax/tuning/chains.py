@@ -130,7 +130,7 @@ class Sampling(Checked):
             "proposal_deviations": self.deviations, "key": self.key, "burn_in": self.burn_in,
             "num_chains": self.num_chains, "thinning": self.thinning,
         }  # fmt: skip
-        identity = identity_of(self.checkpoint, settings, functions)
+        identity = identity_of(self.caller, self.checkpoint, settings, functions)
         num_draws = self.num_steps // self.thinning
         last = self.burn_in + num_draws * self.thinning
         run = LongRun(self.caller, last, self.checkpoint, self.progress, lambda step: identity)

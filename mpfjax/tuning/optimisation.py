@@ -185,7 +185,7 @@ class _Ascent:
             return self._updated(reals, self.optimizer.init(reals), reals)
 
         functions |= {"optimizer": (first, reals)}
-        identity = identity_of(checkpoint, settings, functions)
+        identity = identity_of(self.caller, checkpoint, settings, functions)
         run = LongRun(self.caller, num_steps, checkpoint, progress, lambda step: identity)
         state, stopped = run.go(start, lambda: start, self._advance)
         (reals, _), (values, deviations, path) = state.carry, state.rows

@@ -162,7 +162,7 @@ def smc2(
         "key": key, "num_samples": int(num_samples), "num_moves": int(num_moves),
         "max_particles": max_particles,
     }  # fmt: skip
-    identity = identity_of(checkpoint, settings, {"log_prior": (prior, first)})
+    identity = identity_of("smc2", checkpoint, settings, {"log_prior": (prior, first)})
     run = _Run(sampler, series, key_steps, max_particles, checkpoint, progress, identity)
     return run.posterior(None, jax.random.split(key_filters, num_samples), reals)
 
@@ -209,9 +209,8 @@ class _Run:
 
         def identity(step: int) -> dict[str, str]:
             seen = jax.tree.map(lambda leaf: leaf[:step], self.series)
-            return self.identity | identity_of(
-                self.checkpoint, {"observations": with_present(seen)}, {}
-            )
+            data = {"observations": with_present(seen)}
+            return self.identity | identity_of("smc2", self.checkpoint, data, {})
 
         def start() -> State:
             return like._replace(carry=(started(self.sampler, keys, reals), *like.carry[1:]))
