@@ -46,10 +46,8 @@ class State(NamedTuple):
     """All that a long run goes on from, and that its file holds."""
 
     step: int
-    carry: PyTree
-    """what the next step needs."""
-    rows: PyTree
-    """what is kept of the steps so far: arrays of numpy with a leading axis."""
+    carry: PyTree  # what the next step needs
+    rows: PyTree  # what is kept of the steps so far: arrays of numpy with a leading axis
 
 
 Advance = Callable[[int, int, PyTree], tuple[int, PyTree, PyTree]]

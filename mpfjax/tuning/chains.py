@@ -55,13 +55,10 @@ class PosteriorOfChains:
 class Step(NamedTuple):
     """The result of one step of one chain."""
 
-    state: Any
-    """where the chain is; its `reals` are the parameters."""
-    report: tuple[Any, ...]
-    """what is kept of the step, the parameters first."""
+    state: Any  # its `reals` are the parameters
+    report: tuple[Any, ...]  # what is kept of the step, the parameters first
     acceptance: Float[Array, ""]
-    invalid: dict[str, Array]
-    """how often a density was NaN or +inf, by its name."""
+    invalid: dict[str, Array]  # how often a density was NaN or +inf, by its name
 
 
 class AbstractKernel(eqx.Module):
@@ -104,8 +101,7 @@ class Sampling(Checked):
     caller: str
     key: Key[Array, ""]
     problem: Problem
-    deviations: Reals
-    """of the random walk at first."""
+    deviations: Reals  # of the random walk at first
     num_steps: Count
     num_chains: Count = 1
     sample_prior: SamplePrior | None = None

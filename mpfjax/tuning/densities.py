@@ -39,14 +39,10 @@ class Point(eqx.Module):
     """Parameters, and their log density in its two parts."""
 
     reals: Reals
-    log_prior: Float[Array, "*n"]
-    """with the Jacobian; -inf where it is zero or no number."""
-    log_likelihood: Float[Array, "*n"]
-    """-inf where it is zero, no number, or where the prior is zero."""
-    mixture: Any = None
-    """where their filter stands, for samplers that go on with it."""
-    key_data: Any = None
-    """of the key of their filter's run, for what makes it again."""
+    log_prior: Float[Array, "*n"]  # with the Jacobian; -inf where it is zero or no number
+    log_likelihood: Float[Array, "*n"]  # -inf where it is no number, or either is zero
+    mixture: Any = None  # where their filter stands, for samplers that go on with it
+    key_data: Any = None  # of the key of their filter's run, for what makes it again
 
     @property
     def log_density(self) -> Float[Array, "*n"]:

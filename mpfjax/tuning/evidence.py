@@ -28,8 +28,7 @@ UnbiasedFilter = Annotated[
 class LogEvidence(eqx.Module):
     """log Ẑ of a filter with one seed, summed over sequences of observations."""
 
-    groups: list[Series]
-    """sequences of one shape, stacked."""
+    groups: list[Series]  # sequences of one shape, stacked
 
     def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, ""]:
         """The sum over one run for each sequence."""

@@ -26,8 +26,8 @@ class Sampler(eqx.Module):
     """The problem that the samples belong to, and their moves; a sample is a θ with its filter."""
 
     problem: Problem
+    # The data there are, and whatever comes after them up to a length that programs share.
     series: Series
-    """the data there are, and whatever comes after them up to a length that programs share."""
     prior: Prior
     num_moves: int = eqx.field(static=True)
 

@@ -34,10 +34,10 @@ class Problem(eqx.Module):
 
     leaves: list[Any]
     transforms: dict[str, AbstractTransform]
+    # Of a seed and the tree that the leaves are of, a scalar; its arrays are the data.
     objective: Objective
-    """of a seed and the tree that the leaves are of, a scalar; its arrays are the data."""
+    # The parameters' names, and where they are among the leaves.
     tuned: tuple[tuple[str, int], ...] = eqx.field(static=True)
-    """the parameters' names, and where they are among the leaves."""
     structure: Any = eqx.field(static=True)
 
     @property

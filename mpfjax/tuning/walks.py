@@ -62,14 +62,14 @@ def random_walk(deviations: Reals, starts: Reals) -> RandomWalk:
     """The walk with these deviations, and with the mean of the chains' starts."""
     scales, _ = ravel_pytree(deviations)
     points = jax.vmap(lambda reals: ravel_pytree(reals)[0])(starts)
-    covariance = jnp.diag(scales**2) / _squared_scale(len(scales))
+    covariance = jnp.diag(scales**2) / (_BEST_SCALE**2 / len(scales))
     nothing = jnp.zeros((), scales.dtype)
     return RandomWalk(jnp.diag(scales), jnp.mean(points, axis=0), covariance, nothing)
 
 
 def factor_of(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """F of the best random walk on a target of this covariance."""
-    return cholesky(covariance[None])[0] * math.sqrt(_squared_scale(len(covariance)))
+    return cholesky(covariance[None])[0] * math.sqrt(_BEST_SCALE**2 / len(covariance))
 
 
 def metropolis_step(
@@ -104,7 +104,3 @@ def checked_deviations(given: float | Mapping[str, Any], start: Reals) -> Reals:
             deviations[name] = jnp.broadcast_to(jnp.asarray(by_name[name], u.dtype), u.shape)
         POSITIVE.check(deviations[name], f"proposal_deviations: {name}")
     return deviations
-
-
-def _squared_scale(dimension: int) -> float:
-    return _BEST_SCALE**2 / dimension
