@@ -112,8 +112,8 @@ BUGS = {
     ),
     "a checkpoint counts one step too many": Bug(
         "running/long_runs.py",
-        'notes = {"step": state.step, "identity": self._described(state.step)}',
-        'notes = {"step": state.step + 1, "identity": self._described(state.step)}',
+        'notes = {"step": state.step, "identity": self.identity(state.step)}',
+        'notes = {"step": state.step + 1, "identity": self.identity(state.step)}',
         "tests/test_storage.py -k LongRuns",
     ),
     "a file is renamed before it is written": Bug(
