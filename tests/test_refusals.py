@@ -581,7 +581,7 @@ MISTAKEN = (
     (r"signed_start, line \d+ of test_refusals.py, `if states\[0\] > 0:`: .*jnp.where",
      lambda: run(mpfjax.mixture_particle_filter(
          changed(Batched, sample_initial=signed_start), 20, 2))),
-    (r"signed_density, line \d+ of test_refusals.py, `if states\[0\] > 0:`: .*jnp.where",
+    (r"model: Changed.log_transition, line \d+ of .*, `if states\[0\] > 0:`: .*jnp.where",
      lambda: paths(HISTORY, changed(Batched, log_transition=signed_density))),
     (r"model: OfOne.log_likelihood, line \d+ of test_refusals.py, `if states > 0:`",
      lambda: run_of(mpfjax.per_particle(OfOne()))),

@@ -80,9 +80,7 @@ def _ours(scene: Scene, each: int) -> Any:
     """Positions, which of them are told, labels, and the expected number, by seed and plots."""
     most, undetected = (24, 400) if scene.known else (112, 200)
     size = undetected + most * (each if scene.known else max(each // 3, 1))
-    filter = mpfjax.bernoulli_filter(
-        model_of(scene), size, most, undetected_particles=undetected
-    )  # fmt: skip
+    filter = mpfjax.bernoulli_filter(model_of(scene), size, most, undetected_particles=undetected)
 
     def run(seed: int, plots: np.ndarray) -> tuple[np.ndarray, ...]:
         given = jnp.asarray(plots, jnp.float32)
@@ -126,11 +124,11 @@ def _scores(found: tuple[np.ndarray, ...], truth: np.ndarray) -> tuple[float, fl
     there, is_there = told(truth)
     ospa = np.mean(_ospa(np.float32(places), np.float32(there), is_told, is_there))
     error = np.mean(np.abs(numbers - is_there.sum(axis=1)))
-    blank = lambda values, mask: np.where(mask[..., None], values, np.nan)  # noqa: E731
     switches = np.nan
     if (labels >= 0).all():
-        shown = blank(places, is_told), labels, blank(there, is_there)
-        switches = mpfjax.metrics.track_switches(*shown, cutoff=CUTOFF)
+        shown = np.where(is_told[..., None], places, np.nan)
+        true = np.where(is_there[..., None], there, np.nan)
+        switches = mpfjax.metrics.track_switches(shown, labels, true, cutoff=CUTOFF)
     return float(ospa), float(error), switches
 
 

@@ -26,35 +26,45 @@ def followed(scene: Scene, plots: np.ndarray) -> Iterator[tuple[np.ndarray, floa
     Objects that may appear anywhere are born at the plots of the scan before, with the velocity
     unknown, as filters with births from measurements have it.
     """
-    w, m, P = np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4, 4))
-    born, density = SPOTS, scene.clutter / (2 * HALF_WIDTH) ** 2
-    wide = P0.copy()
-    if not scene.known:
-        born = np.zeros((0, 2))
+    mixture = np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4, 4))
+    born = SPOTS if scene.known else np.zeros((0, 2))
     for scan in plots:
         z = scan[~np.isnan(scan[:, 0])]
-        rate = np.full(len(born), BIRTHS / max(len(born), 1))
-        w = np.concatenate([SURVIVAL * w, rate])
-        m = np.concatenate([m @ A.T, born @ H])
-        P = np.concatenate([A @ P @ A.T + Q, np.broadcast_to(wide, (len(born), 4, 4))])
-        S = H @ P @ H.T + R
-        gains = P @ H.T @ np.linalg.inv(S)
-        updated = (np.eye(4) - gains @ H) @ P
-        gaps = z[:, None] - m @ H.T
-        squares = np.einsum("kni,nij,knj->kn", gaps, np.linalg.inv(S), gaps)
-        likely = np.exp(-0.5 * squares) / (2 * np.pi * np.sqrt(np.linalg.det(S)))
-        shares = scene.p_d * w * likely
-        shares /= density + shares.sum(axis=1, keepdims=True)
-        moved = m + np.einsum("nij,knj->kni", gains, gaps)
-        w = np.concatenate([(1 - scene.p_d) * w, shares.ravel()])
-        m = np.concatenate([m, moved.reshape(-1, 4)])
-        P = np.concatenate([P, np.tile(updated, (len(z), 1, 1))])
-        w, m, P = _merged(w, m, P)
-        yield np.repeat(m @ H.T, np.round(w).astype(int), axis=0), float(w.sum())
-        born = born if scene.known else z
+        mixture = _merged(*_updated(scene, *mixture, born, z))
+        weights, means, _ = mixture
+        yield np.repeat(means @ H.T, np.round(weights).astype(int), axis=0), float(weights.sum())
+        born = SPOTS if scene.known else z
 
 
-def _merged(w: np.ndarray, m: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, ...]:
+Mixture = tuple[np.ndarray, np.ndarray, np.ndarray]  # weights, means and covariances
+
+
+def _updated(
+    scene: Scene, w: np.ndarray, m: np.ndarray, P: np.ndarray, born: np.ndarray, z: np.ndarray
+) -> Mixture:
+    """The intensity after a scan: table I of the paper."""
+    density = scene.clutter / (2 * HALF_WIDTH) ** 2
+    rate = np.full(len(born), BIRTHS / max(len(born), 1))
+    w = np.concatenate([SURVIVAL * w, rate])
+    m = np.concatenate([m @ A.T, born @ H])
+    P = np.concatenate([A @ P @ A.T + Q, np.broadcast_to(P0, (len(born), 4, 4))])
+    S = H @ P @ H.T + R
+    gains = P @ H.T @ np.linalg.inv(S)
+    updated = (np.eye(4) - gains @ H) @ P
+    gaps = z[:, None] - m @ H.T
+    squares = np.einsum("kni,nij,knj->kn", gaps, np.linalg.inv(S), gaps)
+    likely = np.exp(-0.5 * squares) / (2 * np.pi * np.sqrt(np.linalg.det(S)))
+    shares = scene.p_d * w * likely
+    shares /= density + shares.sum(axis=1, keepdims=True)
+    moved = m + np.einsum("nij,knj->kni", gains, gaps)
+    return (
+        np.concatenate([(1 - scene.p_d) * w, shares.ravel()]),
+        np.concatenate([m, moved.reshape(-1, 4)]),
+        np.concatenate([P, np.tile(updated, (len(z), 1, 1))]),
+    )
+
+
+def _merged(w: np.ndarray, m: np.ndarray, P: np.ndarray) -> Mixture:
     """Fewer components of the same intensity: table II of the paper."""
     chosen = w > _LEAST
     w, m, P = w[chosen], m[chosen], P[chosen]
@@ -71,4 +81,5 @@ def _merged(w: np.ndarray, m: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, ..
         w, m, P = w[~near], m[~near], P[~near]
     if not parts:
         return np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4, 4))
-    return tuple(np.array(each) for each in zip(*parts, strict=True))
+    weights, means, covariances = map(np.array, zip(*parts, strict=True))
+    return weights, means, covariances
