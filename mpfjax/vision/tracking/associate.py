@@ -78,7 +78,7 @@ def marginals(log_odds: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
     contributes a factor of 1. The marginals of this joint distribution (joint probabilistic data
     association, Fortmann et al. 1983) are computed by loopy belief propagation with messages from
     rows to columns and back (Williams and Lau 2014). They are exact where the possible pairs form
-    no cycle. Otherwise they are overconfident: up to .3 where each of two rows can go with each of
+    no cycle. Otherwise they are overconfident: up to .41 where each of two rows can go with each of
     two columns.
     """
     highest = np.maximum(np.max(log_odds, axis=1, keepdims=True, initial=0.0), 0.0)
