@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -184,8 +185,8 @@ class Filter(eqx.Module):
 
     @property
     def _periods(self) -> PyTree:
-        as_float = lambda period: jnp.asarray(period, default_float())  # noqa: E731
-        return jax.tree.map(as_float, getattr(self.model, "periods", None))
+        as_floats = partial(jnp.asarray, dtype=default_float())
+        return jax.tree.map(as_floats, getattr(self.model, "periods", None))
 
     def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
         return sample_initial(key, self.model, self.num_particles, self.initial_noise)

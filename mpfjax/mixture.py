@@ -230,8 +230,8 @@ class ParticleMixture(eqx.Module):
             within = self._component_spread(self.particles.mean)
             means = means._replace(covariance=means.covariance + within)
         # Zero would look like a place.
-        alive = lambda leaf: jnp.where(along_rows(self.active, leaf), leaf, jnp.nan)  # noqa: E731
-        return jax.tree.map(alive, means)
+        nowhere = jax.tree.map(partial(jnp.full_like, fill_value=jnp.nan), means)
+        return select_rows(self.active, means, nowhere)
 
     def component_covariances(self, periods: PyTree = None) -> Float[Array, "m d d"]:
         """The weighted covariance of each component's flattened state, zero for a dead one.

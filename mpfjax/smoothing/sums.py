@@ -1,6 +1,7 @@
 """Online smoothing of sums over a trajectory: PaRIS, and fixed-lag smoothing."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -146,8 +147,8 @@ class Terms(NamedTuple):
 
     def variances_in(self, mixture: ParticleMixture) -> PyTree:
         """Over all particles: the variance of the means, and the mean of the variances."""
-        both = lambda mean, variance: mixture.variance(mean) + mixture.average(variance)  # noqa: E731
-        return jax.tree.map(both, *self)
+        between = jax.tree.map(mixture.variance, self.means)
+        return jax.tree.map(jnp.add, between, jax.tree.map(mixture.average, self.variances))
 
     def estimates_in(self, mixture: ParticleMixture) -> "Terms":
         """The moments over all particles of a mixture."""
@@ -265,12 +266,15 @@ class FixedLagSmoother(Checked):
             indices = later if num_draws == 1 else jnp.concatenate(both, axis=1)
         places = indices.reshape(-1)
         earlier = jax.tree.map(lambda leaf: take(leaf, places), mixture.particles)
-        repeat = lambda leaf: jnp.repeat(leaf, num_draws, axis=0)  # noqa: E731
+        repeat = partial(jnp.repeat, repeats=num_draws, axis=0)
         values = self._of_states(earlier, jax.tree.map(repeat, moved.particles))
         no_spread = jax.tree.map(lambda leaf: jnp.zeros_like(jnp.real(leaf)), values)
-        of_rows = lambda rows: jax.tree.map(lambda leaf: take(leaf, places), rows)  # noqa: E731
-        of_pasts = jax.vmap(lambda rows: _over_draws(of_rows(rows), num_draws))
-        return of_pasts(terms), _over_draws(Terms(values, no_spread), num_draws)
+
+        def of_past(term: Terms) -> Terms:
+            drawn = jax.tree.map(partial(take, indices=places), term)
+            return _over_draws(drawn, num_draws)
+
+        return jax.vmap(of_past)(terms), _over_draws(Terms(values, no_spread), num_draws)
 
     def _of_states(self, previous: PyTree, states: PyTree) -> PyTree:
         """h of these states; a `ValueError` unless it is one value a particle."""
@@ -284,8 +288,11 @@ def _over_draws(terms: Terms, num_draws: int) -> Terms:
     """The moments over each particle's draws, which stand side by side."""
     draws = jax.tree.map(lambda leaf: leaf.reshape(-1, num_draws, *leaf.shape[1:]), terms)
     means, within = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=1), draws)
-    between = lambda each, mean: jnp.mean(jnp.abs(each - mean[:, None]) ** 2, axis=1)  # noqa: E731
-    return Terms(means, jax.tree.map(jnp.add, within, jax.tree.map(between, draws.means, means)))
+
+    def both(draws: Array, mean: Array, within: Array) -> Array:
+        return within + jnp.mean(jnp.abs(draws - mean[:, None]) ** 2, axis=1)
+
+    return Terms(means, jax.tree.map(both, draws.means, means, within))
 
 
 @jit_with_floats_traced

@@ -27,7 +27,10 @@ from mpfjax.operations.stored import cond_if_any
 
 def empty_window(now: Step, num_steps: int) -> Window:
     """Room for so many steps like this one, none of them present."""
-    room = lambda leaf: jnp.zeros((num_steps, *jnp.shape(leaf)), jnp.asarray(leaf).dtype)  # noqa: E731
+
+    def room(leaf: Array) -> Array:
+        return jnp.zeros((num_steps, *jnp.shape(leaf)), jnp.asarray(leaf).dtype)
+
     observations, inputs = jax.tree.map(room, (now.observation, inputs_of(now.model)))
     return Window(observations, inputs, jnp.zeros(num_steps, bool))
 
