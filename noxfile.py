@@ -22,11 +22,11 @@ OLDEST = (3, 11)
 BEYOND = (
     "tests/benchmarks",
     "tests/vision",
-    "tests/test_command*",
-    "tests/test_devices.py",
-    "tests/test_documentation.py",
+    "tests/command",
+    "tests/running/test_devices.py",
+    "tests/project/test_documentation.py",
     "tests/test_plotting.py",
-    "tests/test_studies.py",
+    "tests/running/test_studies.py",
 )
 TELL = (
     "import platform, sys, sysconfig;"

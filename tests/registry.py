@@ -1,8 +1,8 @@
 """Every move and every chain of moves, by name: what is listed here inherits the contracts.
 
 `REGROUPINGS` and `WITHIN_COMPONENTS` are held to the contracts of their kind by
-`tests/moves/test_contracts.py`, `CHAINS` to those of filters by `tests/test_chains.py`. A new
-move or filter is one new line below; the tests then find it.
+`tests/moves/test_contracts.py`, `CHAINS` to those of filters by `tests/together/test_chains.py`. A
+new move or filter is one new line below; the tests then find it.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The look-ahead from a model's own noise; that Ẑ stays unbiased is in `tests/test_chains.py`."""
+"""The look-ahead from a model's own noise; for unbiased Ẑ see `tests/together/test_chains.py`."""
 
 import equinox as eqx
 import jax

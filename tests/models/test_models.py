@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 import mpfjax
-from tests.test_exact import MODEL, joint_gaussian
+from tests.exact.test_exact import MODEL, joint_gaussian
 from tests.user_models import Drift, DriftOfOne
 
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)

@@ -1,4 +1,4 @@
-"""Resampling by a look-ahead; that it is unbiased in every chain is in `tests/test_chains.py`."""
+"""Resampling by a look-ahead; that all chains are unbiased is in `together/test_chains.py`."""
 
 import equinox as eqx
 import jax

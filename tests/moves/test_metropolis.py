@@ -1,7 +1,7 @@
 """Whom Metropolis moves take for a particle's parent.
 
-That they leave the target as it is stands in `tests/test_exact_answers.py`, and that the score
-passes through them in `tests/test_gradients.py`.
+That they leave the target as it is stands in `tests/together/test_exact_answers.py`, and that the
+score passes through them in `tests/together/test_gradients.py`.
 """
 
 import jax

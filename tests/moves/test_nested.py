@@ -1,4 +1,4 @@
-"""Families of draws; that they are unbiased in every chain is in `tests/test_chains.py`."""
+"""Families of draws; that all chains are unbiased is in `tests/together/test_chains.py`."""
 
 import equinox as eqx
 import jax

@@ -11,7 +11,7 @@ from mpfjax.tuning import log_density
 from mpfjax.tuning.evidence import pose_evidence
 from mpfjax.tuning.problem import scores
 from tests.marking import exactness
-from tests.test_inputs import INPUTS, OBSERVATIONS, Driven, in_matrices
+from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, in_matrices
 from tests.user_models import TwoSensors
 
 SEEN = np.array([[1.0, np.nan], [0.7, 0.3], [np.nan, 0.9], [np.nan, np.nan], [0.4, -0.2]])

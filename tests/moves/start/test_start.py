@@ -11,7 +11,7 @@ import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.smoothing import conditional_filter, sample_trajectories, with_first_ancestors
 from tests.moves.start.test_window import PLANE, WithKeys
-from tests.test_inputs import INPUTS, OBSERVATIONS, Driven, truth
+from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, truth
 from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import Batched
 

@@ -29,7 +29,7 @@ from tests.precision import float64
 from tests.unbiased import assert_unbiased
 from tests.user_models import TrickyQuadraticModel
 
-REPOSITORY = Path(__file__).resolve().parents[1]
+REPOSITORY = Path(__file__).resolve().parents[2]
 NUM_ISLANDS = on_devices.NUM_ISLANDS
 MODEL = on_devices.quadratic()
 OBSERVATIONS = on_devices.observations()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mpfjax
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 # What a first filter does not need.
 LATER = {"optax", "chex", "matplotlib", "scipy", "mpfjax.tuning", "mpfjax.metrics", "mpfjax.exact"}

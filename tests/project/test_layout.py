@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tests.bugs import BUGS
 
-PACKAGE = Path(__file__).resolve().parents[1] / "mpfjax"
+PACKAGE = Path(__file__).resolve().parents[2] / "mpfjax"
 # From the ground up: each part may import from those above it here, and from itself.
 ORDER = """
     checks operations mixture models moves report filter running lookahead

@@ -9,7 +9,7 @@ import mpfjax
 from mpfjax import Series
 from mpfjax.models.observations import as_series
 from tests import switching
-from tests.test_inputs import INPUTS, OBSERVATIONS, Driven, mean
+from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, mean
 from tests.user_models import ScalarLinear, TwoSensors
 
 HOLED = OBSERVATIONS.at[1].set(jnp.nan)
