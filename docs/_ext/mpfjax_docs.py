@@ -9,6 +9,7 @@ from typing import Any
 
 import docstrings
 from api_names import public_names
+from api_pages import ApiPages
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx import addnodes
@@ -169,6 +170,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """What Sphinx calls."""
     app.add_html_math_renderer("mathml", (visit_math, None), (visit_math_block, None))
     app.add_transform(LinkCode)
+    app.add_directive("api-pages", ApiPages)
     app.connect("autodoc-process-docstring", process_docstring)
     app.connect("autodoc-before-process-signature", forget_rules)
     app.connect("autodoc-process-signature", process_signature)
