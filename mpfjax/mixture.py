@@ -240,8 +240,8 @@ class ParticleMixture(eqx.Module):
         way.
         """
         if (periods := self._periods(periods)) is not None:
-            widened = lambda leaf, period: jnp.broadcast_to(period, leaf[:1].shape)  # noqa: E731
-            every = jax.tree.map(widened, points(self.particles), points(periods))
+            shapes = jax.tree.map(lambda leaf: leaf[:1].shape, points(self.particles))
+            every = jax.tree.map(jnp.broadcast_to, points(periods), shapes)
             periods = flatten_states(every)[0]
         covariances = self._component_spread(flatten_states(self.particles), periods)
         if not isinstance(self.particles, MarginalisedState):

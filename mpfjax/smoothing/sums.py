@@ -233,9 +233,11 @@ class FixedLagSmoother(Checked):
 
     def _no_terms(self, states: PyTree) -> Terms:
         """Zeros for the terms of the first steps, of which there are none: (L + 1, n, ...)."""
-        shapes = jax.eval_shape(self._of_states, states, states)
-        zeros = lambda leaf: jnp.zeros((self.lag + 1, *leaf.shape), leaf.dtype)  # noqa: E731
-        terms = jax.tree.map(zeros, shapes)
+
+        def zeros(leaf: jax.ShapeDtypeStruct) -> Array:
+            return jnp.zeros((self.lag + 1, *leaf.shape), leaf.dtype)
+
+        terms = jax.tree.map(zeros, jax.eval_shape(self._of_states, states, states))
         return Terms(terms, jax.tree.map(jnp.real, terms))
 
     def _of_pasts(
