@@ -1,5 +1,6 @@
 """Which cases of a test run always, which before anything is taken in, and which weekly."""
 
+import itertools
 from collections.abc import Iterable
 from typing import Any
 
@@ -23,7 +24,13 @@ def weekly(cases: Iterable[Any]) -> list[Any]:
     return marked(pytest.mark.weekly, cases)
 
 
-def quick_of(cases: Iterable[Any], always: Iterable[Any]) -> list[Any]:
-    """All the cases, those that are not among `always` marked as `exactness`."""
-    always = list(always)
-    return [case if case in always else exactness([case])[0] for case in cases]
+def quick_of(cases: Iterable[Any], always: Iterable[Any], one_in: int = 1) -> list[Any]:
+    """All the cases: those of `always`, of the others one in so many as `exactness`, rest weekly.
+
+    Those that are taken are spread over the cases: of a product of names, each name has some.
+    """
+    always, others = list(always), itertools.count()
+    return [
+        case if case in always else (weekly if next(others) % one_in else exactness)([case])[0]
+        for case in cases
+    ]

@@ -92,6 +92,7 @@ EXACT = [
     *quick_of(
         [(chain, "quadratic", None) for chain in CHAINS if chain not in APPROXIMATE],
         [(chain, "quadratic", None) for chain in COVERING],
+        one_in=2,
     ),
     *exactness(OTHERWISE),
 ]
