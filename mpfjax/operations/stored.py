@@ -128,13 +128,13 @@ def inverse_permutation(places: Int[Array, " n"]) -> Int[Array, " n"]:
 
 
 def cond_if_any(
-    is_needed: Bool[Array, ""], dear: Callable[[], PyTree], cheap: Callable[[], PyTree]
+    is_needed: Bool[Array, ""], costly: Callable[[], PyTree], cheap: Callable[[], PyTree]
 ) -> PyTree:
-    """`dear()` if any run of the caller's `vmap` needs it, `cheap()` otherwise.
+    """`costly()` if any run of the caller's `vmap` needs it, `cheap()` otherwise.
 
-    For a run that does not need it, `dear()` must give the result of `cheap()`.
+    For a run that does not need it, `costly()` must give the result of `cheap()`.
     """
-    return jax.lax.cond(any_run(is_needed), dear, cheap)
+    return jax.lax.cond(any_run(is_needed), costly, cheap)
 
 
 def drawn_once(key: Key[Array, "*num"], draw: Callable[..., PyTree]) -> PyTree:
