@@ -2,10 +2,10 @@
 
     python -m benchmarks.tracking_speed
 
-24 objects of 100 x 250 pixels walk before a still camera in a rendered video of 1920 x 1080, and in
-the same video at 384 x 288. Without pixels there are also 60 and 150, which are smaller. Each way
-of tracking them is a process of its own, so that its peak memory is its own; they take turns, so
-that what else the machine does is shared by all. Making the frames is not timed, as reading them is
+24 objects of 100 x 250 pixels walk in a rendered video of 1920 x 1080, and in the same video at
+384 x 288. Without pixels there are also 60 and 150, which are smaller. Each way of tracking them is
+a process of its own, so that its peak memory is its own; they take turns, so that what else the
+machine does is shared by all. Making the frames is not timed, as reading them is
 not; nothing is written. The first round compiles and is not counted. `frames/s` is that of the best
 round. Into --out DIR goes tracking_speed.json.
 """

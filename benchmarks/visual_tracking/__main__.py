@@ -68,7 +68,7 @@ def main(
     - `video`: a video file, in place of a sequence.
     - `box`: x,y,w,h, an object, in frame A.
     - `ids`: objects of gt.txt.
-    - `detect`: find what moves; a still camera.
+    - `detect`: find what moves, while the camera stands still.
     - `frames`: A:B, frames A to B, counted from 1, both in.
     - `seeds`: runs; scores are their means.
     """
@@ -135,7 +135,7 @@ def detected_runs(preset: str, source: Source, keys: Array) -> tuple[dict[str, R
     found = ((still, detector.detect(still)) for still in source.read())
     still, boxes = next((pair for pair in found if len(pair[1])), (None, None))
     if still is None or boxes is None:
-        raise ValueError("--detect: nothing moves before a still camera in these frames")
+        raise ValueError("--detect: nothing moves in these frames while the camera stands still")
     source = source._replace(boxes=boxes[: recipes.MAX_COMPONENTS])
     runs = {"pf": drawn_runs(preset, source, keys, still)[0]["pf"]}
     for name, filter in make_mixtures().items():

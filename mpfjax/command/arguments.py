@@ -26,8 +26,8 @@ from mpfjax.vision.tracking.adapters import Rows, first_step
 
 DESCRIPTION = """\
 Track objects in a video or a folder of images. What to track comes from one of three: detections
-in a file, whatever moves before a still camera, or boxes drawn in the first frame. A file of
-detections alone, or a folder with such a file and no images, is tracked without pixels.
+in a file, whatever moves while the camera stands still, or boxes drawn in the first frame. A file
+of detections alone, or a folder with such a file and no images, is tracked without pixels.
 """
 EXAMPLES = """\
 examples:
@@ -101,7 +101,7 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
     what.add_argument(
         "--detections", type=_existing, metavar="FILE", help="MOTChallenge rows, with scores if any"
     )
-    what.add_argument("--detect", action="store_true", help="what moves before a still camera")
+    what.add_argument("--detect", action="store_true", help="find what moves; the camera stands still")
     what.add_argument(
         "--box", action="append", metavar="x,y,w,h", help="an object in the first frame; repeat it"
     )

@@ -23,7 +23,7 @@ _UNKNOWN_HEIGHT = 0.125
 
 
 class BackgroundSubtraction:
-    """Boxes of moving objects before a still camera: an adaptive Gaussian mixture for each pixel.
+    """Boxes of what moves while the camera stands still: an adaptive Gaussian mixture a pixel.
 
     Lin et al. (2012), section 5, detect their targets in this way; the mixture is OpenCV's MOG2
     (Zivkovic 2004). Pixels that fit none of the background's Gaussians and are no shadow form

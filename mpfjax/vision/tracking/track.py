@@ -49,7 +49,7 @@ def track(
 
         track(frames, lambda frame: network(frame))        # boxes, scores and classes
         track(frames, read_detections("det.txt"))          # rows of a MOTChallenge file
-        track(frames, BackgroundSubtraction().detect)      # what moves before a still camera
+        track(frames, BackgroundSubtraction().detect)      # the camera stands still
         track(None, rows)                                  # without pixels, for speed
 
     - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable, or the
