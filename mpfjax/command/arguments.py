@@ -101,7 +101,7 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
     what.add_argument(
         "--detections", type=_existing, metavar="FILE", help="MOTChallenge rows, with scores if any"
     )
-    what.add_argument("--detect", action="store_true", help="find what moves; the camera stands still")
+    what.add_argument("--detect", action="store_true", help="what moves; the camera stands still")
     what.add_argument(
         "--box", action="append", metavar="x,y,w,h", help="an object in the first frame; repeat it"
     )
