@@ -183,7 +183,7 @@ def make_filter(name: str, model: ColourModel, num_particles: int) -> mpfjax.Fil
         return mpfjax.Filter(model, moves, num_particles)
     one_each = [
         mpfjax.KMeans(10, reseed=True, features=_reference),
-        mpfjax.Merge(None, 0.5, features=_reference),
+        mpfjax.Merge(None, max_distance=0.5, features=_reference),
     ]
     return mpfjax.Filter(model, moves, num_particles, 2, one_each)
 

@@ -25,7 +25,6 @@ import mpfjax
 from benchmarks import harness
 from benchmarks.harness import Count, command, data, nothing, pivot, table, turns
 from mpfjax.operations.compiling import cpu_options
-from mpfjax.running.islands import IslandInteraction
 
 FILTERS = {
     "pf": "PF",
@@ -196,7 +195,7 @@ def as_tables(axis: str, entries: list[dict[str, Any]]) -> str:
 def run_as_islands(num_particles: int, repeats: int) -> dict[str, Any]:
     """One particle filter on so many particles, its islands exchanging when they have to."""
     model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
-    moves = [IslandInteraction(), mpfjax.Resample(), mpfjax.Propagate()]
+    moves = [mpfjax.IslandInteraction(), mpfjax.Resample(), mpfjax.Propagate()]
     filter = mpfjax.Filter(model, moves, num_particles // NUM_ISLANDS)
     observations = observed(ISLAND_STEPS)
 

@@ -48,9 +48,11 @@ from mpfjax.moves.base import AbstractWrapper as AbstractWrapper
 from mpfjax.moves.base import Step as Step
 from mpfjax.moves.every import Every as Every
 from mpfjax.moves.initial import SelectInitial as SelectInitial
+from mpfjax.moves.metropolis import AbstractMetropolis as AbstractMetropolis
 from mpfjax.moves.metropolis import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
 from mpfjax.moves.metropolis import RandomWalkMetropolis as RandomWalkMetropolis
 from mpfjax.moves.objects.bernoulli import Associate as Associate
+from mpfjax.moves.objects.exclusion import Exclusion as Exclusion
 from mpfjax.moves.objects.partitioned import Partitioned as Partitioned
 from mpfjax.moves.objects.tracks import Targets as Targets
 from mpfjax.moves.objects.tracks import number_distribution as number_distribution
@@ -75,9 +77,11 @@ from mpfjax.moves.regrouping.split import Split as Split
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample as AuxiliaryResample
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves.resampling.resample import Resample as Resample
+from mpfjax.moves.restarts import RegroupOthers as RegroupOthers
 from mpfjax.operations.compiling import keep_programs as keep_programs
 from mpfjax.operations.random import normal as normal
 from mpfjax.report import StepInfo as StepInfo
+from mpfjax.running.islands import IslandInteraction as IslandInteraction
 from mpfjax.running.islands import run_islands as run_islands
 from mpfjax.running.long_runs import Checkpoint as Checkpoint
 from mpfjax.running.run import monte_carlo as monte_carlo
@@ -89,6 +93,7 @@ from mpfjax.running.studies import Study as Study
 from mpfjax.running.studies import read_study as read_study
 from mpfjax.running.studies import run_study as run_study
 from mpfjax.smoothing.forecasts import forecast as forecast
+from mpfjax.smoothing.variance import with_eve_indices as with_eve_indices
 from mpfjax.transforms import map_moves as map_moves
 from mpfjax.transforms import with_alarm as with_alarm
 from mpfjax.transforms import with_lookahead as with_lookahead

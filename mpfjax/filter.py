@@ -73,6 +73,7 @@ class Filter(eqx.Module):
         num_particles: Count,
         num_components: Count = 1,
         initial_moves: Iterable[Callable[..., ParticleMixture]] = (),
+        *,
         initial_noise: Noise = "independent",
     ) -> None:
         self.model = model

@@ -61,7 +61,7 @@ def particle_filter(
     it for a filtering distribution with one mode. If there are several, it loses all but one.
     `noise="rqmc"` is `with_point_sets`, and `gradient="stop"`, for tuning, `with_score_gradient`.
     """
-    moves = [Resample(scheme, ess_threshold, sort_by=sort_by), Propagate(proposal)]
+    moves = [Resample(scheme, ess_threshold=ess_threshold, sort_by=sort_by), Propagate(proposal)]
     return _with(noise, gradient, Filter(model, moves, num_particles))
 
 
@@ -220,8 +220,8 @@ def partitioned_sampling(
     hardly recover from an occlusion. It is unbiased in every order, also with an interaction.
     `scheme` and `ess_threshold` are those of the resampling between steps and objects.
     """
-    between = Resample(scheme, ess_threshold, allocation="equal")
-    moves = [Resample(scheme, ess_threshold), Partitioned(order, resample=between)]
+    between = Resample(scheme, ess_threshold=ess_threshold, allocation="equal")
+    moves = [Resample(scheme, ess_threshold=ess_threshold), Partitioned(order, resample=between)]
     return Filter(model, moves, num_particles)
 
 
@@ -247,9 +247,9 @@ def distributed_partitioned_sampling(
     all.
     """
     orders = "circular" if orders is None else orders
-    between = Resample(scheme, ess_threshold, allocation="equal")
+    between = Resample(scheme, ess_threshold=ess_threshold, allocation="equal")
     partitioned = Partitioned(orders, resample=between, reassembly=reassembly)
-    resample = Resample(scheme, ess_threshold)
+    resample = Resample(scheme, ess_threshold=ess_threshold)
     return Filter(
         model,
         moves=[Pool(), resample, RandomPartition(), partitioned],
@@ -329,7 +329,11 @@ def bernoulli_filter(
     boxes in a video `vision.ObjectTracker`.
     """
     resample = GaussianRegeneration() if resample is None else resample
-    associate = Associate(particles_per_birth, undetected_particles, resample=resample)
+    associate = Associate(
+        particles_per_birth=particles_per_birth,
+        undetected_particles=undetected_particles,
+        resample=resample,
+    )
     return Filter(model, [Predict(proposal), associate], num_particles, max_targets + 1)
 
 

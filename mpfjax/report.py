@@ -25,7 +25,7 @@ class StepInfo(eqx.Module):
     - `labels_ran_out`: whether all M > 1 labels are in use, so that more modes share one; see
       `Split.is_diffuse`.
     - `log_marginal_likelihood_error`: the standard error of log Ẑ of all steps so far, from this
-      one run; None unless the filter is one of `mpfjax.smoothing.with_first_ancestors`.
+      one run; None unless the filter is one of `mpfjax.with_eve_indices`.
     - `mixture_weight_errors`: the standard error of each mixture weight; None likewise.
     - `log_evidence_against_start`: log of p(y_t | x_{t-1} ~ p_0) over p(y_t | y_1..y_{t-1}): how
       much y_t speaks for a state that begins anew, against all that the filter knows; None unless a

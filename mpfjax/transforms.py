@@ -27,13 +27,13 @@ from mpfjax.moves.start.start import Begin, Start
 
 
 @checked
-def map_moves(change: Callable[[Any], Any], filter: Filter, *, within: bool = True) -> Filter:
+def map_moves(filter: Filter, change: Callable[[Any], Any], *, within: bool = True) -> Filter:
     """The filter with `change(move)` in the place of each move.
 
     It reaches the moves that others hold first, as those of an `Every`, and the resampling within a
     `Partitioned`:
 
-        map_moves(lambda m: Resample("ssp") if isinstance(m, Resample) else m, filter)
+        map_moves(filter, lambda m: Resample("ssp") if isinstance(m, Resample) else m)
 
     - `within`: whether also those that propagations hold, or the chain's own moves alone.
     """
@@ -48,9 +48,9 @@ def map_moves(change: Callable[[Any], Any], filter: Filter, *, within: bool = Tr
     )
 
 
-def _map_kind(kind: Any, change: Callable[[Any], Any], filter: Filter) -> Filter:
+def _map_kind(filter: Filter, kind: Any, change: Callable[[Any], Any]) -> Filter:
     """The same of the chain's own moves of this kind alone."""
-    return map_moves(lambda m: change(m) if isinstance(m, kind) else m, filter, within=False)
+    return map_moves(filter, lambda m: change(m) if isinstance(m, kind) else m, within=False)
 
 
 def _require_resample(filter: Filter, what: str) -> None:
@@ -66,7 +66,7 @@ def with_resampling(filter: Filter, resample: Resample) -> Filter:
     Raises `ValueError` for anything but a `Resample`. Use it for other slots of components:
     `with_resampling(filter, Resample(allocation="equal"))`.
     """
-    return _map_kind(Resample, lambda move: resample, filter)
+    return _map_kind(filter, Resample, lambda move: resample)
 
 
 @checked
@@ -82,7 +82,7 @@ def with_point_sets(filter: Filter) -> Filter:
     def in_order(move: Resample) -> Resample:
         return dataclasses.replace(move, sort_by=HILBERT) if move.sort_by is None else move
 
-    ordered = _map_kind(Resample, in_order, filter)
+    ordered = _map_kind(filter, Resample, in_order)
     return _everywhere(ordered, "noise", "rqmc").replace(initial_noise="rqmc")
 
 
@@ -110,7 +110,7 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
         plain: Any = move.propagate if isinstance(move, PropagateNested) else move
         return plain if num_draws == 1 else PropagateNested(plain, num_draws)
 
-    return _map_kind(AbstractPropagationOfEach, nested, filter)
+    return _map_kind(filter, AbstractPropagationOfEach, nested)
 
 
 @checked
@@ -121,15 +121,15 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
     that is a proposal also draws x_t, where the filter has no other. Raises `ValueError` for a
     filter without `Resample`.
     """
-    plain = _map_kind(AuxiliaryResample, lambda move: move.resample, filter)
+    plain = _map_kind(filter, AuxiliaryResample, lambda move: move.resample)
     look = PilotLookahead() if lookahead is None else lookahead
     _require_resample(plain, "which could look ahead")
 
     def guided(move: Propagate) -> Propagate:
         return dataclasses.replace(move, proposal=look) if move.proposal is None else move
 
-    ahead = _map_kind(Resample, lambda move: AuxiliaryResample(move, look), plain)
-    return _map_kind(Propagate, guided, ahead) if isinstance(look, AbstractProposal) else ahead
+    ahead = _map_kind(plain, Resample, lambda move: AuxiliaryResample(move, look))
+    return _map_kind(ahead, Propagate, guided) if isinstance(look, AbstractProposal) else ahead
 
 
 @checked
@@ -184,6 +184,7 @@ def _regroups(move: AbstractMove) -> bool:
 @checked
 def with_restarts(
     filter: Filter,
+    *,
     probability: InnerShare = 1e-3,
     share: InnerShare = 1 / 4,
     num_draws: Count = 4,
@@ -214,7 +215,7 @@ def with_restarts(
         return Restart(move, **settings) if is_own else _apart(move)
 
     if _has(filter, Restart):
-        return _map_kind(Restart, lambda move: dataclasses.replace(move, **settings), filter)
+        return _map_kind(filter, Restart, lambda move: dataclasses.replace(move, **settings))
     return filter.replace(
         moves=[restarting(move) for move in filter.moves if not isinstance(move, WatchStart)],
         initial_moves=[_apart(move) for move in filter.initial_moves],
@@ -234,18 +235,18 @@ def _apart(move: Any) -> Any:
 
 
 @checked
-def with_alarm(filter: Filter, num_draws: Count = 4096) -> Filter:
+def with_alarm(filter: Filter, num_particles: Count = 4096) -> Filter:
     """The filter that says when all its hypotheses seem wrong: `FilterRun.surprised`.
 
     At each step the increment is compared with the evidence for a state that begins anew:
-    `num_draws` draws of x_0, the same at each step, which cost as much as so many particles. A
+    `num_particles` draws of x_0, the same at each step, cost as much as so many particles. A
     filter of `with_restarts` has the same evidence from its own draws, and stays as it is. Use it
     where a lost target must be noticed.
     """
     if _has(filter, Restart):
         return filter
     others = [move for move in filter.moves if not isinstance(move, WatchStart)]
-    return filter.replace(moves=[*others, WatchStart(num_draws)])
+    return filter.replace(moves=[*others, WatchStart(num_particles)])
 
 
 def _everywhere(filter: Filter, field: str, value: str) -> Filter:
@@ -256,4 +257,4 @@ def _everywhere(filter: Filter, field: str, value: str) -> Filter:
             return node
         return dataclasses.replace(node, **{field: value})
 
-    return map_moves(replaced, filter)
+    return map_moves(filter, replaced)

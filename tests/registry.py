@@ -58,10 +58,10 @@ REGROUPINGS: dict[str, AbstractRegrouping] = {
     "kmeans reseeded": KMeans(3, reseed=True),
     "kmeans on one feature": KMeans(features=lambda states: states[:, 0], scale=0.5),
     "merge by deviations": Merge(),
-    "merge by distance": Merge(None, 1.0, scale=(1.0, 2.0)),
-    "patient merge": Merge(2.0, 1.0, patience=2),
+    "merge by distance": Merge(None, max_distance=1.0, scale=(1.0, 2.0)),
+    "patient merge": Merge(2.0, max_distance=1.0, patience=2),
     "split": Split(),
-    "eager split": Split(1.0, 0.1, min_share=0.0),
+    "eager split": Split(1.0, min_distance=0.1, min_share=0.0),
     "random labels": RandomLabels(),
     "pool": Pool(),
     "random partition": RandomPartition(),
@@ -79,10 +79,14 @@ WITHIN_COMPONENTS: dict[str, AbstractResampling] = {
     "multinomial, adaptive": Resample("multinomial", ess_threshold=0.5),
     "systematic, sorted": Resample(sort_by=lambda states: states[:, 0]),
     "systematic, along a Hilbert curve, adaptive": Resample(ess_threshold=0.5, sort_by="hilbert"),
-    "residual, fixed number, adaptive": Resample("residual", 0.5, 5),
+    "residual, fixed number, adaptive": Resample(
+        "residual", ess_threshold=0.5, particles_per_component=5
+    ),
     "stratified, shared equally": Resample("stratified", allocation="equal"),
     "gaussian": GaussianRegeneration(),
-    "gaussian, fixed number, stratified": GaussianRegeneration(5, noise="stratified"),
+    "gaussian, fixed number, stratified": GaussianRegeneration(
+        particles_per_component=5, noise="stratified"
+    ),
     "gaussian, point sets": GaussianRegeneration(noise="rqmc"),
 }
 
@@ -161,14 +165,16 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
             proposal=GaussNewtonProposal(),
             then=[KMeans(2)],
         ),
-        "patient merge": _chain(Resample(), m=m, then=[Merge(2.0, 1.0, patience=2)]),
+        "patient merge": _chain(Resample(), m=m, then=[Merge(2.0, max_distance=1.0, patience=2)]),
         "grouped by a label": _chain(Resample(), m=m, then=[GroupBy(_side)]),
         "kmeans only": _chain(Resample("stratified"), m=m, then=[KMeans()]),
         "split only, adaptive": _chain(Resample(ess_threshold=0.5), m=m, then=[Split(2.0)]),
         "random labels, residual": _chain(RandomLabels(), Resample("residual"), m=m),
         "gaussian mixture": _chain(GaussianRegeneration(), m=m, then=[KMeans()]),
         "exclusion": _chain(
-            Resample("stratified"), m=m, then=[Exclusion(2.0, 0.5), KMeans(3, reseed=True)]
+            Resample("stratified"),
+            m=m,
+            then=[Exclusion(strength=2.0, radius=0.5), KMeans(3, reseed=True)],
         ),
         "partitioned in clusters": _joint(
             lambda joint: Filter(

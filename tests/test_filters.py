@@ -143,7 +143,7 @@ def test_what_is_missing_is_skipped_as_the_kalman_filter_does(model, linear, obs
     filter, observations = mpfjax.particle_filter(model, 500), np.array(observations, np.float32)
     keys = jax.random.split(KEY, 400)
     run = mpfjax.monte_carlo(keys, filter, observations, mean, missing="skip")
-    exact = kalman_filter(linear, observations, missing="skip")
+    exact = kalman_filter(linear, mpfjax.Series.skipping(observations))
     ratios = ratios_to(exact, run)
     assert_unbiased(ratios, loosest=0.03)
     assert_unbiased(ratios[:, None] * np.asarray(run.collected)[:, -1], exact.means[-1])

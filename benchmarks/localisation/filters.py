@@ -112,10 +112,10 @@ FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
     ),
     "AMCL": lambda model, n, m: mpfjax.Filter(model, [AdaptiveMonteCarlo()], 5000),
     "mixture": mixture,
-    "mixture, with_restarts": lambda model, n, m: mpfjax.with_restarts(mixture(model, n, m), 1e-3),
+    "mixture, with_restarts": lambda model, n, m: mpfjax.with_restarts(mixture(model, n, m)),
     "mixture, with_start": lambda model, n, m: mpfjax.with_start(mixture(model, n, m)),
     "the same, with_restarts": lambda model, n, m: mpfjax.with_restarts(
-        mpfjax.with_start(mixture(model, n, m)), 1e-3
+        mpfjax.with_start(mixture(model, n, m))
     ),
 }
 NAMES = [*FILTERS, *([PEER] if importlib.util.find_spec("blackjax") else [])]

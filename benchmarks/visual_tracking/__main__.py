@@ -125,7 +125,7 @@ def drawn_runs(
     def rows(shots: list[Snapshot], **how: bool) -> list[np.ndarray]:
         return [track_rows(shots, run, source.first, **how) for run in range(len(keys))]
 
-    runs = {name: (follow(each, keys, source.read()), rows) for name, each in filters.items()}
+    runs = {name: (follow(keys, each, source.read()), rows) for name, each in filters.items()}
     return runs, source
 
 

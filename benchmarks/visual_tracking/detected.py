@@ -193,7 +193,9 @@ def make_mixtures() -> dict[str, mpfjax.Filter]:
     def motion(states: Gaussian) -> tuple[Any, Any]:
         return states.place, states.velocity
 
-    regenerated = mpfjax.GaussianRegeneration(PARTICLES, where=motion, noise="stratified")
+    regenerated = mpfjax.GaussianRegeneration(
+        particles_per_component=PARTICLES, where=motion, noise="stratified"
+    )
     return {
         "mpf": chain(mpfjax.Resample(particles_per_component=PARTICLES), matched=False),
         "gm_mpf": chain(regenerated, matched=True),

@@ -24,7 +24,7 @@ _ACCENTED = re.compile(r"\\(hat|bar|tilde|dot)(\{[^{}]*\}| ?[A-Za-z])(?=_)")
 
 
 def target_of(code: str) -> str | None:
-    """The full name of what a piece of code names, `Merge` say, or `mpfjax.Merge(None, 0.5)`."""
+    """The full name of what a piece of code names, `Merge` say, or `mpfjax.Merge(2.0)`."""
     found = re.fullmatch(r"([A-Za-z_][\w.]*)(\(.*\))?", code, re.DOTALL)
     if found is None:
         return None

@@ -1,6 +1,6 @@
 """The grid filter, for scalar models."""
 
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -50,8 +50,6 @@ def grid_filter(
     log_initial: Float[Array, " g"] | None = None,
     *,
     state_shape: tuple[int, ...] = (),
-    inputs: PyTree = None,
-    missing: Literal["error", "skip"] = "error",
 ) -> GridFilterRun:
     """The recursion of Vermaak et al. (2003), eqs. 1 and 2, by quadrature on an even grid.
 
@@ -61,7 +59,7 @@ def grid_filter(
       the smallest standard deviation of the model. The error then falls faster than any power of
       the spacing.
     - `log_initial`: log p(x_0) at the grid points; None calls the model's own `log_initial`.
-    - `observations`: arrays, or a `Series`; `inputs` and `missing` as for `run_filter`.
+    - `observations`: arrays, or a `Series`.
 
     Costs O(t g²). Differentiable in the model's parameters. Raises `ValueError` for a grid that is
     not one row of evenly spaced, ascending numbers, a `log_initial` of another length, a
@@ -76,7 +74,7 @@ def grid_filter(
         require(model, "log_initial", "grid_filter without log_initial")
     else:
         log_initial = real_array(str(len(points)), "log_initial", log_initial)
-    series = as_series(observations, model, inputs, missing)
+    series = as_series(observations, model)
     return _grid_filter(model, series, points, width, log_initial, state_shape)
 
 

@@ -1,7 +1,7 @@
 """The Kalman filter and smoother, for linear-Gaussian models."""
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -61,40 +61,28 @@ class KalmanSmootherRun(eqx.Module):
 
 
 @checked
-def kalman_filter(
-    model: LinearGaussianModel,
-    observations: PyTree,
-    *,
-    inputs: PyTree = None,
-    missing: Literal["error", "skip"] = "error",
-) -> KalmanFilterRun:
+def kalman_filter(model: LinearGaussianModel, observations: PyTree) -> KalmanFilterRun:
     """The Kalman filter (Kalman 1960), with the library's convention: y_1 follows x_1, not x_0.
 
     Covariances are factors U diag(D) Uᵀ, and no variance is a difference: in float32 log Z is right
     to 0.05 up to a diffuse prior of P_0 / R = 1e13. Differentiable, and `jax.vmap` maps it over
     several series.
 
-    - `observations`: an array (t, p), or a `Series` of one.
-    - `inputs`: those of the model, controls or matrices that change in time; as for `run_filter`.
-    - `missing`: "skip", as `Series.skipping`, leaves out each number that is NaN: of two sensors,
-      the one that is there counts. (A particle filter leaves out the whole step, unless its model
-      has `handles_missing`.) With "error" a NaN is a `ValueError`, as far as the numbers are known.
+    - `observations`: an array (t, p), or a `Series` of one, whose inputs are those of the model:
+      controls, or matrices that change in time. `Series.skipping` leaves out each number that is
+      NaN: of two sensors, the one that is there counts. (A particle filter leaves out the whole
+      step, unless its model has `handles_missing`.) Otherwise a NaN is a `ValueError`, as far as
+      the numbers are known.
 
     Raises `ValueError` for another model and observations that are not (t, p). Use it as the
     reference for a linear-Gaussian model.
     """
-    filtered, increments = _kalman_filter(model, *_checked(model, observations, inputs, missing))
+    filtered, increments = _kalman_filter(model, *_checked(model, observations))
     return KalmanFilterRun(*filtered, increments, jnp.sum(increments))
 
 
 @checked
-def kalman_smoother(
-    model: LinearGaussianModel,
-    observations: PyTree,
-    *,
-    inputs: PyTree = None,
-    missing: Literal["error", "skip"] = "error",
-) -> KalmanSmootherRun:
+def kalman_smoother(model: LinearGaussianModel, observations: PyTree) -> KalmanSmootherRun:
     """E and Cov of x_0, ..., x_t given y_1..y_t, by the recursion of Rauch, Tung and Striebel 1965.
 
     After the Kalman filter it goes back from x_t. With (m, P) the filter's moments at s, and (m',
@@ -105,11 +93,11 @@ def kalman_smoother(
     where C is Cov[x_s | x_{s+1}, y_1..y_s]. Precision, derivatives, arguments and errors are those
     of `kalman_filter`. Use it as the reference for particle smoothers of a linear-Gaussian model.
     """
-    return _smooth(model, *_checked(model, observations, inputs, missing))
+    return _smooth(model, *_checked(model, observations))
 
 
-def _checked(model: Any, data: PyTree, inputs: PyTree, missing: str) -> tuple[Any, PyTree]:
-    series = gathered(data, inputs, missing)
+def _checked(model: Any, data: PyTree) -> tuple[Any, PyTree]:
+    series = gathered(data)
     rows = checked_rows(series, model.H.shape[0], model.m0.dtype)
     return rows, steps_of_inputs(series.inputs, rows.shape[0], model)
 

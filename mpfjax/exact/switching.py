@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.checks import checked
 from mpfjax.exact.kalman import (
@@ -16,7 +16,7 @@ from mpfjax.exact.kalman import (
     smoothed,
 )
 from mpfjax.models.linear import SwitchingLinearGaussianModel
-from mpfjax.models.observations import Series
+from mpfjax.models.observations import gathered, steps_of_inputs
 from mpfjax.operations.logarithms import log_sum_exp
 
 
@@ -44,18 +44,20 @@ _MOST_SEQUENCES = 2**20
 
 @checked
 def switching_filter(
-    model: SwitchingLinearGaussianModel, observations: Float[Array, "t ..."]
+    model: SwitchingLinearGaussianModel, observations: PyTree
 ) -> SwitchingFilterRun:
     """All K^(t+1) sequences of regimes z_0, ..., z_t, and a Kalman smoother for each.
 
     The answer is exact. No recursion gives it, since
-    the number of Gaussians grows K-fold with every step. An entry of the observations that is NaN
-    is missing. Differentiable. Raises `ValueError` for another model, for observations that are not
+    the number of Gaussians grows K-fold with every step. `observations` are an array (t, p), or a
+    `Series` of one, of which `Series.skipping` leaves out each number that is NaN. Differentiable.
+    Raises `ValueError` for another model, for observations that are not
     (t, p), and for more than a million sequences. Use it as the reference for a short series.
     """
-    series = Series.skipping(observations)
+    series = gathered(observations)
     rows = checked_rows(series, model.H.shape[-2], model.m0.dtype)
     length, k = rows.shape[0], model.num_regimes
+    steps_of_inputs(series.inputs, length, model)
     if k ** (length + 1) > _MOST_SEQUENCES:
         number = f"{k}^{length + 1} sequences, more than {_MOST_SEQUENCES}"
         raise ValueError(f"observations: {length} steps of {k} regimes are {number}")

@@ -73,7 +73,7 @@ class TwistInitial(AbstractMove):
             return mixture
         psi, model = self.twist.initial, cast(Any, now.model)
         shape, dtype = (mixture.num_particles, model.initial_noise_dimension + 1), psi.slopes.dtype
-        noise = draw_noise(self.noise, key, shape, dtype)
+        noise = draw_noise(key, self.noise, shape, dtype)
         drawn, log_ratio = psi.draw(noise, jnp.zeros((shape[0], 1), dtype))
         states = with_moments(model, model.initial_from_noise(drawn))
         check_moved(states, mixture.particles, model, "initial_from_noise")
@@ -103,7 +103,7 @@ class PropagateTwisted(AbstractPropagation, AbstractWrapper):
             return _counted(self.move(key, mixture, now))
         model, previous = now.model, mixture.particles
         dimension = noise_dimension(model, previous) + 1
-        noise = noise_of_slots(self.move.noise, key, dimension, mixture)
+        noise = noise_of_slots(key, self.move.noise, dimension, mixture)
         psi = self.twist.next(mixture)
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
         made = completed(model, made_of(model, drawn, previous), previous)

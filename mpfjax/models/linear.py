@@ -174,10 +174,14 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
     R: Annotated[NoiseOfEach, COVARIANCE] = eqx.field(converter=to_array("R"))
     m0: Annotated[VectorOfEach, FINITE] = eqx.field(converter=to_array("m0"))
     P0: Annotated[SquareOfEach, COVARIANCE] = eqx.field(converter=to_array("P0"))
-    b: Annotated[VectorOfEach, FINITE] | None = eqx.field(converter=to_array("b"), default=None)
-    c: Annotated[OffsetOfEach, FINITE] | None = eqx.field(converter=to_array("c"), default=None)
+    b: Annotated[VectorOfEach, FINITE] | None = eqx.field(
+        converter=to_array("b"), default=None, kw_only=True
+    )
+    c: Annotated[OffsetOfEach, FINITE] | None = eqx.field(
+        converter=to_array("c"), default=None, kw_only=True
+    )
     initial_probabilities: Annotated[Float[Array, " k"], PROBABILITIES] | None = eqx.field(
-        converter=to_array("initial_probabilities"), default=None
+        converter=to_array("initial_probabilities"), default=None, kw_only=True
     )
 
     @property

@@ -270,7 +270,7 @@ class PairwiseRepulsion(Fitting):
     - `strength`: -log ψ of two objects at the same point, in nats; positive.
     - `radius`: in the unit of the positions; positive. With `compact`, k(r) = (1 - r²)² inside the
       radius and exactly 0 outside it. Without it, k(r) = exp(-r²/2), which is positive everywhere.
-    - `position`: maps the states of one object, leading axis n, to (n, k) or (n,); None takes
+    - `features`: maps the states of one object, leading axis n, to (n, k) or (n,); None takes
       the whole state.
 
     Called with the states of two objects, it gives (n,). Raises `ValueError` for a strength or
@@ -280,7 +280,7 @@ class PairwiseRepulsion(Fitting):
 
     strength: Annotated[Float[Array, ""], POSITIVE] = eqx.field(converter=to_array("strength"))
     radius: Annotated[Float[Array, ""], POSITIVE] = eqx.field(converter=to_array("radius"))
-    position: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
+    features: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
     compact: bool = eqx.field(static=True, default=True)
 
     def __call__(self, states: PyTree, other_states: PyTree) -> Float[Array, " n"]:
@@ -291,7 +291,7 @@ class PairwiseRepulsion(Fitting):
         return -self.strength.astype(gaps.dtype) * nearness
 
     def _positions(self, states: PyTree) -> Float[Array, "n k"]:
-        return flatten_states(states if self.position is None else self.position(states))
+        return flatten_states(states if self.features is None else self.features(states))
 
 
 def _is_array(leaf: Any) -> bool:

@@ -28,8 +28,8 @@ _UNUSED = 9  # bits of 32 that no draw of 23 bits shows
 
 
 def draw_noise(
-    kind: str,
     key: Key[Array, ""],
+    kind: str,
     shape: tuple[int, ...],
     dtype: jnp.dtype,
     components: Int[Array, " n"] | None = None,

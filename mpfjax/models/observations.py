@@ -27,9 +27,9 @@ class Series(eqx.Module):
     inputs: PyTree = None
     """u_1, ..., u_t, finite numbers, which the model finds in its field `inputs` at each step, also
     at one without an observation; None where the model knows none."""
-    present: Bool[Array | np.ndarray, " t"] | None = None
+    present: Bool[Array | np.ndarray, " t"] | None = eqx.field(default=None, kw_only=True)
     """which observations are there; at the others the filter only predicts. None is all of them."""
-    skips_missing: bool = eqx.field(static=True, default=False)
+    skips_missing: bool = eqx.field(static=True, default=False, kw_only=True)
     """whether steps with a NaN or an infinity are missing, as `skipping` has it."""
 
     @classmethod
@@ -57,7 +57,7 @@ def as_series(data: PyTree, model: Any, inputs: PyTree = None, missing: str = "e
     observations = as_arrays(series.observations)
     length = _length(observations, series.observations, "observations")
     present = present_steps(observations, series, refused_by(model))
-    return Series(observations, steps_of_inputs(series.inputs, length, model), present)
+    return Series(observations, steps_of_inputs(series.inputs, length, model), present=present)
 
 
 def gathered(data: PyTree, inputs: PyTree = None, missing: str = "error") -> Series:

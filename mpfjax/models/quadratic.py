@@ -37,7 +37,7 @@ class QuadraticModel(AbstractStateSpaceModel, Fitting):
     low: Finite = eqx.field(static=True, default=-2.5)
     high: Finite = eqx.field(static=True, default=2.5)
     initial_draw: Literal["stratified", "independent"] = eqx.field(
-        static=True, default="stratified"
+        static=True, default="stratified", kw_only=True
     )
 
     def __check_init__(self) -> None:

@@ -66,7 +66,7 @@ class AbstractMove(Given):
     """whether each particle comes from one particle of the mixture that the move was given, or
     begins anew. Where it does not, what follows ancestors refuses the move."""
     keeps_families = True
-    """whether it draws independently, or tells the memory of first ancestors, so that the errors of
+    """whether it draws independently, or tells the memory of Eve indices, so that the errors of
     one run are known."""
     biases_score = False
     """whether it redraws particles in a way that derivatives in the model's parameters do not see,

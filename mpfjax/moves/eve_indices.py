@@ -23,7 +23,7 @@ class EveIndices(eqx.Module):
     - `indices`: (n,), the slot in x_0 that each particle descends from.
     - `groups`: (n,), the component in which each particle was last resampled.
     - `log_pair_factors`: (m, m), the logarithm of the factor by which a pair of particles without a
-      common first ancestor counts, by their groups. Among k independent draws, a share (k - 1) / k
+      common Eve index counts, by their groups. Among k independent draws, a share (k - 1) / k
       of the pairs are pairs of different draws. A pair's factor therefore grows by k / (k - 1)
       whenever the component that both are in is resampled.
     """
@@ -42,7 +42,7 @@ class EveIndices(eqx.Module):
 
 
 def with_new_eve_indices(mixture: ParticleMixture) -> ParticleMixture:
-    """The mixture of x_0, every particle its own first ancestor."""
+    """The mixture of x_0, every particle its own Eve."""
     n, m = mixture.num_particles, mixture.num_components
     eve = EveIndices(
         indices=jnp.arange(n, dtype=jnp.int32),
@@ -108,7 +108,7 @@ def _variance(families: Float[Array, "m n"], mixture: ParticleMixture) -> Float[
 def _by_components(eve: EveIndices, mixture: ParticleMixture) -> Float[Array, "m m"]:
     """The pair factors by component: the average over the pairs, by group, that are in two.
 
-    Only pairs without a common first ancestor count. The others would have been in the same
+    Only pairs without a common Eve index count. The others would have been in the same
     component more often, and the factors would come out too large.
     """
     m = mixture.num_components

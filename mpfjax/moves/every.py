@@ -30,14 +30,14 @@ class Every(AbstractWrapper):
     depend on the run: under `vmap` over seeds the steps between cost nothing. A missing observation
     does not count as a step, since nothing is regrouped or resampled there.
 
-    - `num_steps`: k, from 1 on.
+    - `every`: k, from 1 on.
     - `moves`: regrouping and resampling moves, in order.
 
     Raises `ValueError` for k < 1, no moves, and a move of another kind: without a propagation at
     every step the state would not move. Use it where regrouping is a large part of the time.
     """
 
-    num_steps: Count = eqx.field(static=True)
+    every: Count = eqx.field(static=True)
     moves: Moves = eqx.field(converter=lambda moves: as_moves(moves, "moves"))
 
     holds = ("moves",)
@@ -51,7 +51,7 @@ class Every(AbstractWrapper):
     @property
     def name(self) -> str:
         """The name under which the number of the step is kept."""
-        return f"every {self.num_steps}: {', '.join(type(move).__name__ for move in self.moves)}"
+        return f"every {self.every}: {', '.join(type(move).__name__ for move in self.moves)}"
 
     def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
         """The number of steps since the moves last ran, and the moves' own memory."""
@@ -60,7 +60,7 @@ class Every(AbstractWrapper):
 
     def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
         """Which components of `mixture` the moves would resample now."""
-        runs = mixture.memory[self.name]["steps"] == self.num_steps - 1
+        runs = mixture.memory[self.name]["steps"] == self.every - 1
         return super().would_resample(mixture, now) & runs
 
     def __call__(
@@ -70,8 +70,8 @@ class Every(AbstractWrapper):
         if is_missing(now):
             return mixture
         steps = mixture.memory[self.name]["steps"] + 1
-        counted = mixture.memory | {self.name: {"steps": steps % self.num_steps}}
-        mixture, runs = mixture.replace(memory=counted), steps == self.num_steps
+        counted = mixture.memory | {self.name: {"steps": steps % self.every}}
+        mixture, runs = mixture.replace(memory=counted), steps == self.every
 
         def run() -> ParticleMixture:
             moved: Any = mixture

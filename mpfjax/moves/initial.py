@@ -50,7 +50,7 @@ def sample_initial(
     else:
         maker = cast(Any, model)
         shape = (num_particles, maker.initial_noise_dimension)
-        particles = maker.initial_from_noise(draw_noise(noise, key, shape, default_float()))
+        particles = maker.initial_from_noise(draw_noise(key, noise, shape, default_float()))
     check_states(particles, model, "sample_initial", num_particles)
     return with_moments(model, particles)
 

@@ -45,7 +45,7 @@ class AbstractMetropolis(AbstractMarkovMove):
     """Steps of Metropolis and Hastings for every particle, given its parent x_{t-1}.
 
     The move of a resample-move filter (Gilks and Berzuini 2001). After x_t was drawn and weighed,
-    and perhaps resampled, each x_t takes `num_steps` steps of a Markov chain that leaves D(x_t |
+    and perhaps resampled, each x_t takes `num_moves` steps of a Markov chain that leaves D(x_t |
     x_{t-1}) L(y_t | x_t)^β invariant. The weights do not change, Ẑ stays unbiased, and offspring of
     one particle become distinct. Components keep their mass and their particles.
 
@@ -54,7 +54,7 @@ class AbstractMetropolis(AbstractMarkovMove):
     `least_step` and 0 and drawn anew each time. The standard deviation is that of new draws from
     D(. | x_{t-1}). Integer parts of the state do not move.
 
-    - `num_steps`: how many steps each particle takes.
+    - `num_moves`: how many steps each particle takes.
     - `least_step`: the smallest s.
     - `exponent`: β, for a likelihood that enters by powers, as with `Reweight(exponent)`.
     - `gradient`: "none" differentiates the draws, "stop" the density of the state after the move,
@@ -64,10 +64,10 @@ class AbstractMetropolis(AbstractMarkovMove):
     model without `log_transition`.
     """
 
-    num_steps: Count = eqx.field(static=True, default=1)
-    least_step: InnerShare = eqx.field(static=True, default=0.02)
-    exponent: Exponent = eqx.field(static=True, default=1.0)
-    gradient: Gradient = eqx.field(static=True, default="none")
+    num_moves: Count = eqx.field(static=True, default=1)
+    least_step: InnerShare = eqx.field(static=True, default=0.02, kw_only=True)
+    exponent: Exponent = eqx.field(static=True, default=1.0, kw_only=True)
+    gradient: Gradient = eqx.field(static=True, default="none", kw_only=True)
 
     needs_parents = True
     """the target of x_t is given x_{t-1}."""
@@ -96,7 +96,7 @@ class AbstractMetropolis(AbstractMarkovMove):
             states = without_gradient(states)
         first = densities = target(states)
         dtype = densities[1].dtype
-        for step_key in split(key, self.num_steps):
+        for step_key in split(key, self.num_moves):
             key_length, key_proposal, key_taken = split(step_key, 3)
             length = self.least_step ** uniform(key_length, (mixture.num_particles,), dtype)
             proposed, log_ratio = self.propose(key_proposal, length, states, target)

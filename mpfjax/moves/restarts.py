@@ -55,9 +55,9 @@ class Restart(AbstractWrapper):
     """
 
     resample: Any
-    probability: InnerShare = eqx.field(static=True, default=1e-3)
-    share: InnerShare = eqx.field(static=True, default=1 / 4)
-    num_draws: Count = eqx.field(static=True, default=4)
+    probability: InnerShare = eqx.field(static=True, default=1e-3, kw_only=True)
+    share: InnerShare = eqx.field(static=True, default=1 / 4, kw_only=True)
+    num_draws: Count = eqx.field(static=True, default=4, kw_only=True)
 
     holds = ("resample",)
     keeps_mass = False
@@ -158,10 +158,10 @@ class WatchStart(AbstractMove):
     The report's `log_evidence_against_start` is log of the mean of p(y_t | x_{t-1}) over the draws,
     less the increment. `with_alarm` makes a filter with it.
 
-    - `num_draws`: of x_0, the same at every step.
+    - `num_particles`: of x_0, the same at every step.
     """
 
-    num_draws: Count = eqx.field(static=True, default=4096)
+    num_particles: Count = eqx.field(static=True, default=4096)
 
     weighs = False
     keeps_mass = True
@@ -190,7 +190,7 @@ class WatchStart(AbstractMove):
             return jnp.zeros_like(increment)
         now = without_gradient(now)
         key_drawn, key_moved = jax.random.split(jax.random.key(0))
-        draws = single_component(sample_initial(key_drawn, now.model, self.num_draws))
+        draws = single_component(sample_initial(key_drawn, now.model, self.num_particles))
         anew = now.propagation(key_moved, draws, now)  # pyright: ignore[reportOptionalCall]
         return anew.log_mass - jax.lax.stop_gradient(increment)
 

@@ -57,12 +57,12 @@ class Study(Checked):
     observations: PyTree
     """y_1..y_t, one data set for all, or a `Series`."""
     settings: Annotated[Mapping[str, Values], by_name(np.iterable, "values")] = field(
-        default_factory=dict
+        default_factory=dict, kw_only=True
     )
     """by name: the values of each setting, numbers or strings. All combinations are run."""
-    measure: Callable[[FilterRun], Mapping[str, Any]] = log_evidence
+    measure: Callable[[FilterRun], Mapping[str, Any]] = field(default=log_evidence, kw_only=True)
     """arrays by name from a cell's runs, each with the leading axis of seeds."""
-    collect: Callable[[ParticleMixture], PyTree] | None = nothing
+    collect: Callable[[ParticleMixture], PyTree] | None = field(default=nothing, kw_only=True)
     """as for `run_filter`, for `measure` to use; None keeps all of every mixture."""
 
     def __check_init__(self) -> None:

@@ -10,4 +10,3 @@ from mpfjax.smoothing.variance import (
     log_marginal_likelihood_variance as log_marginal_likelihood_variance,
 )
 from mpfjax.smoothing.variance import mixture_weight_errors as mixture_weight_errors
-from mpfjax.smoothing.variance import with_first_ancestors as with_first_ancestors

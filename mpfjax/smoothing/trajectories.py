@@ -34,7 +34,7 @@ def sample_trajectories(
     *,
     component: CountOrZero | None = None,
     method: Literal["exact", "mcmc"] = "exact",
-    num_steps: Count | None = None,
+    num_moves: Count | None = None,
     inputs: PyTree = None,
     observations: PyTree = None,
 ) -> PyTree:
@@ -51,10 +51,10 @@ def sample_trajectories(
       mixtures alone.
     - `component`: draw x_t from this component of the last mixture alone: the past of one mode.
     - `method`: "exact" weighs all N particles, O(N) for a trajectory and step. "mcmc" (Dau and
-      Chopin 2023) starts at the ancestor of x_{s+1} and makes `num_steps` steps of independent
+      Chopin 2023) starts at the ancestor of x_{s+1} and makes `num_moves` steps of independent
       Metropolis-Hastings, with proposals by W_s: O(1) for a trajectory and step. It is as exact as
       N grows.
-    - `num_steps`: of "mcmc"; None is one.
+    - `num_moves`: of "mcmc"; None is one.
     - `inputs`: u_1, ..., u_t, the known inputs that the run had.
     - `observations`: y_1..y_t, arrays or a `Series`, which a conditionally linear model needs and
       no other takes; a NaN is a missing number.
@@ -91,7 +91,7 @@ def sample_trajectories(
     else:
         if method == "mcmc":
             stacked = with_parents(stacked, "sample_trajectories with method 'mcmc', not 'exact',")
-        options = (num_trajectories, component, 0 if method == "exact" else num_steps or 1)
+        options = (num_trajectories, component, 0 if method == "exact" else num_moves or 1)
         drawn, indices = draw_trajectories(key, model, stacked, inputs, *options)
     _warn_of_few(indices, stacked)
     return drawn
@@ -106,7 +106,7 @@ def _check_component(mixtures: ParticleMixture, component: int) -> None:
 
 @jit_on_wide_vectors
 def draw_trajectories(
-    key, model, mixtures, inputs, num_trajectories, component=None, num_steps=0, checked=True
+    key, model, mixtures, inputs, num_trajectories, component=None, num_moves=0, checked=True
 ):
     """`sample_trajectories` without its checks of arguments, and the particles' indices, (t, k).
 
@@ -133,10 +133,10 @@ def draw_trajectories(
     num_earlier = mixtures.log_weights.shape[0] - 1
     earlier = jax.tree.map(lambda leaf: leaf[:-1], mixtures)
     ancestors, proposed = mixtures.ancestor_indices[1:], None
-    if num_steps > 0:
+    if num_moves > 0:
         # All times in one go, since proposals do not depend on the states after them.
         keys = jax.random.split(key_proposed, num_earlier)
-        shape = (num_steps, num_trajectories)
+        shape = (num_moves, num_trajectories)
         proposed = jax.vmap(lambda key, logs: draw(key, shape, logs))(keys, earlier.log_weights)
     keys = jax.random.split(key_steps, num_earlier)
     steps = (keys, earlier, ancestors, starts_of(mixtures)[1:], proposed, inputs)

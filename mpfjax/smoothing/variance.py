@@ -1,4 +1,4 @@
-"""Standard errors of log Ẑ, masses and means: from one run by first ancestors, or from a batch."""
+"""Standard errors of log Ẑ, masses and means: from one run by Eve indices, or from a batch."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ FEWEST_RUNS = 4
 _INDEPENDENT = {"scheme": "multinomial", "noise": "independent", "initial_noise": "independent"}
 
 
-class _KeepFirstAncestors(AbstractMove):
+class _KeepEveIndices(AbstractMove):
     """Puts an `EveIndices` into the mixture of x_0, which `Resample` then keeps up to date."""
 
     weighs = False
@@ -36,14 +36,14 @@ class _KeepFirstAncestors(AbstractMove):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:
-        """The mixture with a memory in which every particle is its own first ancestor."""
+        """The mixture with a memory in which every particle is its own Eve."""
         del key, now
         return with_new_eve_indices(mixture)
 
 
 @checked
-def with_first_ancestors(filter: Filter) -> Filter:
-    """The same filter, which also remembers the first ancestor of each particle.
+def with_eve_indices(filter: Filter) -> Filter:
+    """The same filter, which also remembers the Eve index of each particle.
 
     Draws and weights are the same to the bit, but that no `SelectInitial` chooses x_0: what it
     keeps are no independent draws. A step takes O(N) more memory and time, and the runs
@@ -53,7 +53,7 @@ def with_first_ancestors(filter: Filter) -> Filter:
     `PropagateIndependently`, `PropagateInClusters` or `IslandInteraction`), and for draws that are
     not independent: a scheme other than "multinomial", or a noise other than "independent".
     """
-    check_keep_parents("filter", filter.moves, "with_first_ancestors")
+    check_keep_parents("filter", filter.moves, "with_eve_indices")
     for move in all_of(filter.moves):
         if move.approximate or not move.keeps_families:
             name = type(move).__name__
@@ -68,15 +68,15 @@ def with_first_ancestors(filter: Filter) -> Filter:
             chosen, name = getattr(part, option, known), type(part).__name__
             if chosen != known:
                 raise ValueError(f"filter: {option} of {name} is {chosen!r}, not {known!r}")
-    if any(isinstance(move, _KeepFirstAncestors) for move in filter.initial_moves):
+    if any(isinstance(move, _KeepEveIndices) for move in filter.initial_moves):
         return filter
     kept = [move for move in filter.initial_moves if not move.weighs]
-    return filter.replace(initial_moves=[*kept, _KeepFirstAncestors()])
+    return filter.replace(initial_moves=[*kept, _KeepEveIndices()])
 
 
 @checked
 def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[Array, ""]:
-    """An estimate of the variance of log Ẑ, from one run of `with_first_ancestors(filter)`.
+    """An estimate of the variance of log Ẑ, from one run of `with_eve_indices(filter)`.
 
     Particles with different ancestors in x_0 are nearly independent. The fewer families hold the
     weight, the more Ẑ varies (Chan and Lai 2013). A family is all descendants of one particle of
@@ -97,7 +97,7 @@ def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[
     (k_m - 1) / k_m of the pairs only. Hence a pair counts by the product of k_m / (k_m - 1) over
     the resamplings of components that their ancestors were in together:
 
-        V = 1 - N / (N - 1) Σ_{i, j without common first ancestor} W_i W_j Π k_m / (k_m - 1).
+        V = 1 - N / (N - 1) Σ_{i, j without common Eve index} W_i W_j Π k_m / (k_m - 1).
 
     The products of all pairs would be O(N²) numbers. They are averaged over the pairs of each two
     components, which are M² numbers, and exact for one component or where all components are
@@ -115,7 +115,7 @@ def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[
       `monte_carlo`.
 
     The estimate is inf for a run with a step of zero likelihood, whose log Ẑ is -inf. Raises
-    `ValueError` for a run of a filter without first ancestors, and one of islands. Use it to
+    `ValueError` for a run of a filter without Eve indices, and one of islands. Use it to
     choose N: particle Metropolis-Hastings wants a variance of about one (Doucet et al. 2015).
     """
     mixture = _with_lineage(run)
@@ -125,14 +125,14 @@ def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[
 
 @checked
 def mixture_weight_errors(run: FilterRun | ParticleMixture) -> Float[Array, " m"]:
-    """The standard error of each mixture weight π_m, from a run of `with_first_ancestors(filter)`.
+    """The standard error of each mixture weight π_m, from a run of `with_eve_indices(filter)`.
 
     How much π_m would vary over runs of the same filter. π_m is the estimate of the probability of
     an event, that a particle is in component m, and its variance is that of Lee and Whiteley
     (2018), section 4, for a normalised estimate: the formula of `log_marginal_likelihood_variance`
     with W_i (1[c_i = m] - π_m) in place of the weights,
 
-        V_m = - N / (N - 1) Σ_{i, j without common first ancestor} u_i u_j Π k_m / (k_m - 1).
+        V_m = - N / (N - 1) Σ_{i, j without common Eve index} u_i u_j Π k_m / (k_m - 1).
 
     For one resampling in common it is the sum over families of (S_em - π_m S_e)², S_em being the
     part of family e that is in component m.
@@ -146,7 +146,7 @@ def mixture_weight_errors(run: FilterRun | ParticleMixture) -> Float[Array, " m"
     - `run`: a `FilterRun`, or a mixture that `step` returned. `StepInfo.mixture_weight_errors` has
       them at every step. In `collect`, call it of each mixture.
 
-    Raises `ValueError` for a run of a filter without first ancestors, and one of islands. Use it to
+    Raises `ValueError` for a run of a filter without Eve indices, and one of islands. Use it to
     see whether a mass is reliable.
     """
     return jnp.sqrt(jnp.maximum(_mass_variances(_with_lineage(run)), 0.0))
@@ -157,12 +157,12 @@ _mass_variances = eqx.filter_jit(mass_variances)
 
 
 def _with_lineage(run: FilterRun | ParticleMixture) -> ParticleMixture:
-    """The last mixture of a run; a `ValueError` unless it has first ancestors in common."""
+    """The last mixture of a run; a `ValueError` unless it has Eve indices in common."""
     mixture = run.final if isinstance(run, FilterRun) else run
     if EVE_INDICES not in mixture.memory:
-        raise ValueError("run: its filter keeps no first ancestors; run with_first_ancestors of it")
+        raise ValueError("run: its filter keeps no Eve indices; run with_eve_indices of it")
     if mixture.memory[EVE_INDICES].indices.ndim != 1:
-        raise ValueError("run: islands, or several runs, have no first ancestors in common")
+        raise ValueError("run: islands, or several runs, have no Eve indices in common")
     return mixture
 
 
@@ -195,7 +195,7 @@ def batch_estimate(
 
     and Ẑ is unbiased (Vergé et al. 2015). The errors are those of the jackknife over runs (Efron
     1982), (B - 1) / B Σ_b (q_(b) - mean of q_(.))², with q_(b) the estimate without run b. They
-    need only independent runs, and hold for every scheme, noise and move. (`with_first_ancestors`
+    need only independent runs, and hold for every scheme, noise and move. (`with_eve_indices`
     needs multinomial draws.)
 
     - `runs`: what `monte_carlo` returned for B keys, four or more. Twelve to thirty of N / B

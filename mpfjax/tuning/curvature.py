@@ -75,7 +75,7 @@ def errors_at(
 
     def score(flat: np.ndarray) -> Float[np.ndarray, "seeds d"]:
         at = unravel(jnp.asarray(flat))
-        each = [np.asarray(score_of_each(problem, at, keys), float) for keys in batches]
+        each = [np.asarray(score_of_each(keys, problem, at), float) for keys in batches]
         return np.concatenate(each)
 
     # By number, how far a step may go.

@@ -82,7 +82,7 @@ class LogDensity(eqx.Module):
         self, key: Key[Array, ""], reals: Reals
     ) -> tuple[Point, dict[str, Bool[Array, ""]]]:
         """Its two parts, and which of them are no numbers."""
-        point, invalid = evaluated(reals, self.prior(reals), self.problem.value(reals, key))
+        point, invalid = evaluated(reals, self.prior(reals), self.problem.value(key, reals))
         return dataclasses.replace(point, key_data=jax.random.key_data(key)), invalid
 
     @property

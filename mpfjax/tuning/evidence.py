@@ -97,4 +97,4 @@ def with_present(series: Series) -> Series:
     """The series that says of each step whether its observation is there."""
     if series.present is not None:
         return series
-    return Series(series.observations, series.inputs, np.ones(series.length, bool))
+    return Series(series.observations, series.inputs, present=np.ones(series.length, bool))

@@ -30,30 +30,21 @@ Optimizer = Annotated[
 class TuningRun:
     """The result of `fit` or `maximise`, and its history."""
 
-    model: Any
-    """the model, or of `fit` the filter, with the parameters at the end; if it was stopped, the
-    last good ones."""
+    tuned: Any
+    """the filter, or of `maximise` the model, with the parameters at the end; if it was stopped,
+    the last good ones."""
     parameters: dict[str, np.ndarray]
     """the same, by name, on their own scale."""
     value: float
-    """the objective with these parameters: the mean over seeds."""
+    """the objective with these parameters, of `fit` the log marginal likelihood summed over
+    sequences: the mean over seeds."""
     history: dict[str, np.ndarray]
-    """by step: `value`, or of `fit` `log_marginal_likelihood`, the mean over seeds, and
-    `deviation`, its standard deviation, with each parameter, by name, as it was then."""
+    """by step: `value`, the mean over seeds, and `deviation`, its standard deviation, with each
+    parameter, by name, as it was then."""
     stopped: str | None
     """why it ended before `num_steps`, or None."""
     standard_errors: dict[str, np.ndarray] | None = None
     """of every number in the parameters; None if not asked for, or if there is no maximum."""
-
-    @property
-    def filter(self) -> Filter:
-        """Of `fit`: the filter with the parameters at the end."""
-        return self.model
-
-    @property
-    def log_marginal_likelihood(self) -> float:
-        """Of `fit`: the mean over seeds with these parameters, summed over sequences."""
-        return self.value
 
 
 @checked
@@ -117,8 +108,8 @@ def fit(
 @checked
 def maximise(
     key: Key[Array, ""],
-    objective: Objective,
     model: Any,
+    objective: Objective,
     optimizer: Optimizer,
     num_steps: Count,
     *,
@@ -135,9 +126,9 @@ def maximise(
     for another objective, such as that of an unnormalised likelihood on labelled frames
     (`LabelLikelihood`).
 
+    - `model`: the pytree that the objective is a function of.
     - `objective`: a function, or an `equinox.Module` with a `__call__`, whose arrays are the data.
       An objective without randomness ignores its key, and needs one seed.
-    - `model`: the pytree that the objective is a function of.
     - `parameters`: as for `fit`, picked from `model`; None is every floating point array of it.
 
     Raises what `fit` does for the same arguments, and `ValueError` for an objective that is not a
@@ -145,10 +136,10 @@ def maximise(
     """
     problem = pose(model, objective, parameters, transforms)
     ascent = _Ascent("maximise", "value", key, problem, optimizer, num_seeds)
-    found = eqx.filter_eval_shape(problem.value, problem.start(), key)
+    found = eqx.filter_eval_shape(problem.value, key, problem.start())
     if getattr(found, "shape", None) != () or not jnp.issubdtype(found.dtype, jnp.floating):
         raise ValueError(f"objective: it returns {shown(found)}, no floating point scalar")
-    functions = {"objective": (problem.value, problem.start(), key)}
+    functions = {"objective": (problem.value, key, problem.start())}
     data = {"objective": objective}
     _, run = ascent.climb(num_steps, checkpoint, progress, data, functions)
     return TuningRun(*run)
@@ -197,7 +188,7 @@ class _Ascent:
                 stopped = f"{fault} at step {state.step}"
                 warn(f"{self.caller}: {stopped}; its result is of the step before", UserWarning)
             reals, value = jax.tree.map(lambda rows: jnp.asarray(rows[-1]), path), float(values[-1])
-        history = {self.objective: values, "deviation": deviations}
+        history = {"value": values, "deviation": deviations}
         history |= self.problem.constrained_rows(path)
         parameters = jax.tree.map(np.asarray, self.problem.constrain(reals))
         return reals, (self.problem.at(reals), parameters, value, history, stopped)
@@ -205,7 +196,7 @@ class _Ascent:
     def _evaluated(self, step: int, reals: Reals) -> tuple[np.ndarray, Reals]:
         """The objective of each seed, and the gradient of their mean; `Broken` if not finite."""
         keys = jax.random.split(jax.random.fold_in(self.key, step), self.num_seeds)
-        values, gradient = scores(self.problem, reals, keys)
+        values, gradient = scores(keys, self.problem, reals)
         values, named = np.asarray(values), self.objective.replace("_", " ")
         broken = [name for name, leaf in gradient.items() if not np.isfinite(leaf).all()]
         if not np.isfinite(values).all():

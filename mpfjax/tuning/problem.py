@@ -111,19 +111,19 @@ class Problem(eqx.Module):
             leaves[index] = values[name]
         return jax.tree.unflatten(self.structure, leaves)
 
-    def value(self, reals: Reals, key: Key[Array, ""]) -> Float[Array, ""]:
+    def value(self, key: Key[Array, ""], reals: Reals) -> Float[Array, ""]:
         """The objective of one seed."""
         return self.objective(key, self.at(reals))
 
 
 @eqx.filter_jit
 def scores(
-    problem: Problem, reals: Reals, keys: Key[Array, " seeds"]
+    keys: Key[Array, " seeds"], problem: Problem, reals: Reals
 ) -> tuple[Float[Array, " seeds"], Reals]:
     """The objective of each seed, and the gradient of their mean."""
 
     def mean(reals: Reals) -> tuple[Float[Array, ""], Float[Array, " seeds"]]:
-        values = jax.vmap(lambda key: problem.value(reals, key))(keys)
+        values = jax.vmap(lambda key: problem.value(key, reals))(keys)
         return jnp.mean(values), values
 
     gradient, values = jax.grad(mean, has_aux=True)(reals)
@@ -132,11 +132,11 @@ def scores(
 
 @eqx.filter_jit
 def score_of_each(
-    problem: Problem, reals: Reals, keys: Key[Array, " seeds"]
+    keys: Key[Array, " seeds"], problem: Problem, reals: Reals
 ) -> Float[Array, "seeds d"]:
     """The gradient of each seed's objective, as `ravel_pytree` lays the parameters out."""
-    gradient = jax.grad(problem.value)
-    return jax.vmap(lambda key: ravel_pytree(gradient(reals, key))[0])(keys)
+    gradient = jax.grad(problem.value, argnums=1)
+    return jax.vmap(lambda key: ravel_pytree(gradient(key, reals))[0])(keys)
 
 
 def pose(

@@ -73,7 +73,7 @@ PUSHED, STILL = SURE | {"Q": turned(np.diag([0.0, 0.3]))}, SURE | {"Q": np.zeros
 def test_kalman_filter_and_smoother_condition_the_joint_gaussian(parts, observations):
     """Whatever is missing or known for sure: moments, those of neighbours, and the evidence."""
     model, length = mpfjax.LinearGaussianModel(**parts), len(observations)
-    run = kalman_smoother(model, observations, missing="skip")
+    run = kalman_smoother(model, Series.skipping(observations))
     filtered = kalman_filter(model, Series.skipping(observations))
     mean, covariance = joint_gaussian(**parts, length=length, with_first=True)
     states, y = 2 * (length + 1), observations.ravel()
@@ -103,9 +103,9 @@ def test_kalman_filter_and_smoother_condition_the_joint_gaussian(parts, observat
 @pytest.mark.parametrize("reference", [kalman_filter, kalman_smoother])
 def test_a_missing_number_is_no_error_to_jax_debug_nans(reference):
     model = mpfjax.LinearGaussianModel(**MODEL)
-    plain = reference(model, GAPS, missing="skip")
+    plain = reference(model, Series.skipping(GAPS))
     with jax.debug_nans(True):
-        debugged = reference(model, GAPS, missing="skip")
+        debugged = reference(model, Series.skipping(GAPS))
     assert debugged.log_marginal_likelihood == plain.log_marginal_likelihood
 
 
@@ -113,7 +113,7 @@ def test_kalman_smoother_of_several_series_at_once_and_its_derivative():
     model, gaps = mpfjax.LinearGaussianModel(**MODEL), jnp.asarray(GAPS)
 
     def means(rows):
-        return kalman_smoother(model, rows, missing="skip").means
+        return kalman_smoother(model, Series.skipping(rows)).means
 
     together = jax.vmap(means)(jnp.stack([gaps, -gaps]))
     np.testing.assert_allclose(together[1], means(-gaps), rtol=1e-5, atol=1e-6)

@@ -71,7 +71,7 @@ def of_the_whole(observations):
 
 
 def of_regimes(observations):
-    return switching_filter(REGIMES, observations)
+    return switching_filter(REGIMES, mpfjax.Series.skipping(observations))
 
 
 GAP, ROWS = mixed.OBSERVATIONS.at[2].set(jnp.nan), NOISY[:, None]

@@ -181,7 +181,7 @@ class TestPairwiseRepulsion:
         np.testing.assert_allclose(smooth, -2 * np.exp([0, -1 / 50, -0.5, -50]), rtol=1e-5)
 
     def test_sees_the_positions_that_it_is_given(self):
-        first = PairwiseRepulsion(1.0, 4.0, position=lambda states: states["box"][:, 0])
+        first = PairwiseRepulsion(1.0, 4.0, features=lambda states: states["box"][:, 0])
         states = {"box": self.PLACES, "age": jnp.arange(4)}
         other = {"box": jnp.zeros((4, 2)), "age": jnp.arange(4)}
         squares = np.array([0, 1, 9, 900]) / 16

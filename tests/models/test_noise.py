@@ -126,9 +126,9 @@ def one_of_family(key, d):
 
 
 DRAWS = {
-    "stratified": lambda key, d: draw_noise("stratified", key, (N, d), FLOAT),
-    "rqmc": lambda key, d: draw_noise("rqmc", key, (N, d), FLOAT, LABELS, 3),
-    "rqmc, dealt anew": lambda key, d: draw_noise("rqmc", key, (N, d), FLOAT, LABELS, 3, True),
+    "stratified": lambda key, d: draw_noise(key, "stratified", (N, d), FLOAT),
+    "rqmc": lambda key, d: draw_noise(key, "rqmc", (N, d), FLOAT, LABELS, 3),
+    "rqmc, dealt anew": lambda key, d: draw_noise(key, "rqmc", (N, d), FLOAT, LABELS, 3, True),
     "one of a family": one_of_family,
 }
 
@@ -174,7 +174,7 @@ def test_rows_of_a_component_cover_the_normal_far_more_evenly(d):
     slots = (np.arange(n) % 64 / 64)[:, None]
 
     def error(kind):
-        draw = jax.jit(jax.vmap(lambda key: draw_noise(kind, key, (n, d), FLOAT, labels, 2)))
+        draw = jax.jit(jax.vmap(lambda key: draw_noise(key, kind, (n, d), FLOAT, labels, 2)))
         return (slots * np.tanh(np.asarray(draw(KEYS[:500]))))[:, 64:].mean(axis=(1, 2)).std()
 
     assert error("rqmc") < 0.25 * error("independent")
@@ -187,7 +187,7 @@ def test_noise_dealt_twice_is_independent_of_itself_and_still_a_point_set(name, 
     n, keys = 1000, jax.random.split(jax.random.key(3), 400)
 
     def draw(key):
-        return draw_noise(name, key, (n, d), FLOAT, shuffle=True)
+        return draw_noise(key, name, (n, d), FLOAT, shuffle=True)
 
     found = np.asarray(jax.jit(jax.vmap(draw))(keys), float)
     products = np.mean(found[0::2] * found[1::2], axis=1)
@@ -199,7 +199,7 @@ def test_noise_dealt_twice_is_independent_of_itself_and_still_a_point_set(name, 
 
 def test_a_hundred_thousand_rows_stay_finite_and_uniform_ones_fill_each_cell():
     for kind in ("rqmc", "stratified"):
-        noise = draw_noise(kind, KEYS[0], (100_000, 2), FLOAT)
+        noise = draw_noise(KEYS[0], kind, (100_000, 2), FLOAT)
         assert np.isfinite(noise).all()
         assert len(np.unique(noise[:, 0])) > 99_000
     points = np.asarray(stratified_uniform(KEYS[0], 50))

@@ -61,9 +61,11 @@ def test_with_equal_regimes_it_is_the_kalman_filter_and_smoother_where_numbers_a
     parts = parts_of(1)
     linear = mpfjax.LinearGaussianModel(A=parts.pop("F"), B=parts.pop("b")[:, None], **parts)
     observations, inputs = OBSERVATIONS.at[2].set(jnp.nan), jnp.ones((len(OBSERVATIONS), 1))
-    found = switching_filter(model, observations)
-    of_filter = kalman_filter(linear, observations, inputs=inputs, missing="skip")
-    of_smoother = kalman_smoother(linear, observations, inputs=inputs, missing="skip")
+    series = mpfjax.Series.skipping(observations)
+    found = switching_filter(model, series)
+    series = mpfjax.Series.skipping(observations, inputs)
+    of_filter = kalman_filter(linear, series)
+    of_smoother = kalman_smoother(linear, series)
     for one, other in (
         (found.means, of_filter.means),
         (found.covariances, of_filter.covariances),

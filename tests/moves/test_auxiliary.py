@@ -58,7 +58,9 @@ def moved_by(look, observation):
 @pytest.mark.exactness
 def test_what_is_expected_stays_the_same_in_every_component():
     """E[Σ_{c_i = m} exp(ℓ_i) φ(x_i)] is what it was, whatever the look-ahead."""
-    move = AuxiliaryResample(Resample("multinomial", 0.4), lambda y, states: y * states)
+    move = AuxiliaryResample(
+        Resample("multinomial", ess_threshold=0.4), lambda y, states: y * states
+    )
 
     def sums(mixture):
         scaled = mixture.weights * jnp.exp(mixture.log_scale)

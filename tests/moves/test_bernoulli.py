@@ -145,7 +145,9 @@ def test_one_scan_is_that_of_all_associations(apart):
     n, existence, scan = 400, np.array([0.9, 0.5, 0.2]), np.array([0.3, apart, 2 * apart + 0.5])
     rng, targets = np.random.default_rng(0), model()
     states = rng.normal(0, 0.5, (3, n, 1)) + apart * np.arange(3)[:, None, None]
-    filter = Filter(targets, [Associate(400, 100)], 3 * n + 100, 8)
+    filter = Filter(
+        targets, [Associate(particles_per_birth=400, undetected_particles=100)], 3 * n + 100, 8
+    )
     mixture = bernoulli_mixture(filter, states, existence)
     padded = jnp.asarray(np.append(scan, NAN)[:, None], jnp.float32)
     moved, info = filter.step(KEY, mixture, padded)
@@ -266,7 +268,7 @@ def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
     """One object that may exist, against the product of the sensors' likelihoods."""
     near = ClutteredModel(OBJECT, lambda states: jnp.where(states[:, 0] < 1, 0.9, 0.0), CLUTTER)
     targets = TargetsModel((SENSOR, near), GaussianBirth(1e-12, OBJECT), 0.95)
-    filter = Filter(targets, [Associate(2, 10)], 110, 3)
+    filter = Filter(targets, [Associate(particles_per_birth=2, undetected_particles=10)], 110, 3)
     states = np.random.default_rng(0).normal(0.5, 1, (1, 100, 1))
     mixture, r = bernoulli_mixture(filter, states, [0.9]), 0.95 * 0.9
     for scan in ([[0.2], [NAN]], [[NAN], [NAN]]):
@@ -336,7 +338,7 @@ def test_the_number_is_that_of_independent_events():
 
 def test_quantiles_are_those_of_each_object():
     states = np.stack([np.linspace(0, 1, 101), np.linspace(5, 7, 101)])[..., None]
-    filter = Filter(model(), [Predict(), Associate(50, 10)], 212, 3)
+    filter = Filter(model(), [Predict(), Associate(undetected_particles=10)], 212, 3)
     found = mpfjax.targets(bernoulli_mixture(filter, states, [0.5, 0.25]), q=(0.1, 0.5))
     np.testing.assert_allclose(found.quantiles[..., 0], [[0.1, 0.5], [5.2, 6.0]], atol=0.03)
     np.testing.assert_allclose(found.existence, [0.5, 0.25], atol=1e-6)

@@ -55,7 +55,7 @@ def test_a_label_that_dies_within_and_is_used_again_has_no_past():
     mixture = mpfjax.ParticleMixture(
         states, jnp.full(30, -jnp.log(30.0)), jnp.repeat(jnp.arange(3), 10), jnp.arange(30), 3
     )
-    every = Every(1, [Merge(None, 1.0, patience=2), Split(1.0)])
+    every = Every(1, [Merge(None, max_distance=1.0, patience=2), Split(1.0)])
     durations = jnp.array([[5, 5, 0], [5, 5, 0], [0, 0, 5]], jnp.int32)
     memory = every.initial_memory(MODEL, 3) | {"overlap_durations": durations}
     after = every(KEYS[0], mixture.replace(memory=memory))

@@ -15,7 +15,7 @@ def test_each_particle_is_weighed_down_by_the_other_components_means():
     states = np.array([[0.0], [1.0], [1.5], [9.0], [7.0]])
     log_weights = np.array([0.0, 1.0, 0.5, 0.0, -np.inf])
     mixture = make_mixture(states, log_weights, [0, 0, 1, 2, 2], 4)
-    move = eqx.filter_jit(Exclusion(3.0, 0.5, scale=2.0))
+    move = eqx.filter_jit(Exclusion(strength=3.0, radius=0.5, scale=2.0))
     moved = move(jax.random.key(0), mixture, NOW)
     means = np.array([0.5, 1.5, 9.0]) / 2
     bumps = np.exp(-((states / 2 - means[None]) ** 2) / (2 * 0.5**2))

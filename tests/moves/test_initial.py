@@ -10,7 +10,7 @@ import pytest
 import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.initial import SelectInitial, trusted
-from mpfjax.smoothing import conditional_filter, with_first_ancestors
+from mpfjax.smoothing import conditional_filter
 from tests.moves.start.test_window import PLACES, WithKeys
 from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import ScalarLinear
@@ -127,7 +127,7 @@ def test_where_x_0_must_be_a_plain_draw_it_is_one():
     same = conditional_filter(KEY, make(1), OBSERVATIONS, trajectory)
     np.testing.assert_array_equal(found.trajectory, same.trajectory)
     chosen = make(8, scheme="multinomial")
-    assert not with_first_ancestors(chosen).weighs_initially
+    assert not mpfjax.with_eve_indices(chosen).weighs_initially
 
 
 def test_impossible_and_empty_particles():

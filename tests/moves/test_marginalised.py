@@ -145,7 +145,7 @@ def test_an_entry_that_is_missing_is_left_out_and_a_step_without_any_is_predicte
         np.ones((1, 1)), LINEAR.A, LINEAR.Q, LINEAR.H, LINEAR.R, LINEAR.m0, LINEAR.P0
     )
     run = mpfjax.run_filter(KEY, ONE, gaps, lambda m: m.mean(), missing=missing)
-    assert_equals(run, switching_filter(regimes_alike, gaps))
+    assert_equals(run, switching_filter(regimes_alike, mpfjax.Series.skipping(gaps)))
 
 
 def test_inputs_reach_the_dynamics():

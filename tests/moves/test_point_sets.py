@@ -159,6 +159,6 @@ class OneSided(mpfjax.QuadraticModel):
 def test_x_0_is_a_point_set_unless_it_has_another_law():
     filter = mpfjax.particle_filter(OneSided(0.3, 0.5), 20, noise="rqmc")
     np.testing.assert_array_equal(filter.init(KEY).particles, 1.5)
-    model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0, "independent")
+    model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0, initial_draw="independent")
     start = mpfjax.particle_filter(model, 100, noise="rqmc").init(KEY)
     assert np.diff(np.sort(start.particles)).max() < 4 * 4.0 / 100

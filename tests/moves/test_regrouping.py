@@ -89,7 +89,7 @@ def of_weights(log_weights):
     return make_mixture(np.array([0.0, 10, 10, 0]), log_weights, [0, 0, 1, 1], 2)
 
 
-BY_DISTANCE = Merge(None, 1.0, scale=(3.0, 1.0))
+BY_DISTANCE = Merge(None, max_distance=1.0, scale=(3.0, 1.0))
 MERGED = {
     "overlap": (Merge(1.0), clouds([[0, 0], [0.2, 0], [10, 0], [10, 8]], [40] * 4), [0, 0, 2, 3]),
     "chain": (Merge(2.0), clouds([[3.0], [1.5], [0.0], [40.0]], [200] * 4), [0, 0, 0, 3]),
@@ -97,9 +97,21 @@ MERGED = {
     "beyond two deviations": (Merge(2.0), clouds([[0.0], [2.2]], [4000] * 2), [0, 1]),
     "within a distance": (BY_DISTANCE, two_at(2.7), [0, 0]),
     "beyond a distance": (BY_DISTANCE, two_at(3.3), [0, 1]),
-    "both conditions": (Merge(2.0, 1.0), clouds([[0.0], [3.0]], [50] * 2, scale=10.0), [0, 1]),
-    "weighted": (Merge(None, 1.0), of_weights(np.log([0.999, 0.001, 0.001, 0.999])), [0, 0]),
-    "weighted apart": (Merge(None, 1.0), of_weights(np.log([0.999, 0.001, 0.999, 0.001])), [0, 1]),
+    "both conditions": (
+        Merge(2.0, max_distance=1.0),
+        clouds([[0.0], [3.0]], [50] * 2, scale=10.0),
+        [0, 1],
+    ),
+    "weighted": (
+        Merge(None, max_distance=1.0),
+        of_weights(np.log([0.999, 0.001, 0.001, 0.999])),
+        [0, 0],
+    ),
+    "weighted apart": (
+        Merge(None, max_distance=1.0),
+        of_weights(np.log([0.999, 0.001, 0.999, 0.001])),
+        [0, 1],
+    ),
 }
 
 
@@ -142,8 +154,8 @@ class TestSplit:
     @pytest.mark.parametrize(
         ("move", "splits"),
         [
-            (Split(4.0, 2.0, scale=5.0), True),
-            (Split(4.0, 3.0, scale=5.0), False),
+            (Split(4.0, min_distance=2.0, scale=5.0), True),
+            (Split(4.0, min_distance=3.0, scale=5.0), False),
             (Split(min_share=0.05), True),
             (Split(min_share=0.2), False),
         ],

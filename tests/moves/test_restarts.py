@@ -53,7 +53,7 @@ FILTERS = {
 
 @pytest.mark.parametrize("name", quick_of(FILTERS, ["mixture"]))
 def test_evidence_is_unbiased_for_the_kernel(name):
-    filter = mpfjax.with_restarts(FILTERS[name], PROBABILITY)
+    filter = mpfjax.with_restarts(FILTERS[name], probability=PROBABILITY)
     keys = jax.random.split(jax.random.key(0), SEEDS)
     runs = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, lambda mixture: None, missing="skip")
     ratios = np.exp(np.asarray(runs.log_marginal_likelihood) - log_evidence_on_a_grid())
@@ -64,7 +64,7 @@ def test_evidence_is_unbiased_for_the_kernel(name):
 
 def test_of_a_part_of_the_slots_they_take_a_share_of_that_part():
     """The alarm rings; the survivors keep three quarters of the slots that may be used."""
-    filter = mpfjax.with_restarts(mpfjax.particle_filter(MODEL, 240), PROBABILITY)
+    filter = mpfjax.with_restarts(mpfjax.particle_filter(MODEL, 240), probability=PROBABILITY)
     mixture = filter.init(jax.random.key(0))
     log_weights = jnp.where(jnp.arange(240) < 40, -jnp.log(40.0), -jnp.inf)
     mixture = mixture.replace(
@@ -127,7 +127,7 @@ def test_smoothing_knows_that_states_began_anew():
         exact.append(points @ smoothed / smoothed.sum())
         future = kernel @ (normal(seen[t - 1], points, 0.5) * future)
     exact = np.array(exact[::-1])
-    filter = mpfjax.with_restarts(mpfjax.particle_filter(MODEL, 300), PROBABILITY)
+    filter = mpfjax.with_restarts(mpfjax.particle_filter(MODEL, 300), probability=PROBABILITY)
 
     def before(previous, states):
         return previous

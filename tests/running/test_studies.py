@@ -81,7 +81,9 @@ class TestResults:
             np.testing.assert_allclose(entry["evidence"], run.log_marginal_likelihood, rtol=1e-5)
             np.testing.assert_allclose(entry["means"], run.collected, rtol=1e-4)
         np.testing.assert_equal(read_study(tmp_path), results)
-        plain = mpfjax.Study({"pf": build}, [8], study.keys, OBSERVATIONS, {"noise": [0.1]})
+        plain = mpfjax.Study(
+            {"pf": build}, [8], study.keys, OBSERVATIONS, settings={"noise": [0.1]}
+        )
         (entry,) = run_study(plain, tmp_path / "plain", **options)
         np.testing.assert_allclose(entry["log_marginal_likelihood"], results[0]["evidence"], 1e-5)
 

@@ -112,7 +112,7 @@ class Smoother(NamedTuple):
 SMOOTHERS = {
     "genealogy": Smoother(of_run=_genealogy),
     "backward sampling": Smoother(of_run=_backward()),
-    "backward sampling, MCMC": Smoother(of_run=_backward(method="mcmc", num_steps=8)),
+    "backward sampling, MCMC": Smoother(of_run=_backward(method="mcmc", num_moves=8)),
     "PaRIS": Smoother(online=_online(), summed=True),
     "PaRIS, MCMC": Smoother(online=_online(method="mcmc", num_draws=3), summed=True),
     "fixed lag": Smoother(online=_online(lag=LAG), lag=LAG),

@@ -13,7 +13,7 @@ from tests.smoothing.registry import MODELS, QUADRATIC
 from tests.smoothing.test_contracts import NUM_RUNS, exact_trajectories
 
 _, SQUARES = MODELS["two modes"]
-EAGER = (Merge(2.0), Split(1.0, 0.1, min_share=0.0), KMeans(2))
+EAGER = (Merge(2.0), Split(1.0, min_distance=0.1, min_share=0.0), KMeans(2))
 
 
 def chain(*moves, n, m):
@@ -38,7 +38,9 @@ CASES = {
     ),
     "looking ahead, adaptive": (
         chain(
-            mpfjax.AuxiliaryResample(Resample("stratified", 0.7), lambda y, x: -((y - x**2) ** 2)),
+            mpfjax.AuxiliaryResample(
+                Resample("stratified", ess_threshold=0.7), lambda y, x: -((y - x**2) ** 2)
+            ),
             Propagate(), *EAGER, n=8, m=3,
         ),
         True,

@@ -77,7 +77,7 @@ def test_intervals_are_the_kalman_filters():
     states = ahead.mixtures.particles
     found = interval(ahead.mixtures, jnp.concatenate([states, ahead.observations], axis=2))
     unknown = jnp.concatenate([seen, jnp.full((NUM_STEPS, 1), jnp.nan)])
-    exact = kalman_filter(LINEAR, unknown, missing="skip")
+    exact = kalman_filter(LINEAR, mpfjax.Series.skipping(unknown))
     means, variances = exact.means[-NUM_STEPS:, 0], exact.covariances[-NUM_STEPS:, 0, 0]
     error = np.sqrt(0.05 * 0.95 / run.final.effective_sample_size)
     for kind, spread in enumerate((variances, variances + 0.4)):

@@ -8,13 +8,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_smoother
-from mpfjax.smoothing import (
-    backward,
-    sample_trajectories,
-    smoothed_sums,
-    trace_ancestors,
-    with_first_ancestors,
-)
+from mpfjax.smoothing import backward, sample_trajectories, smoothed_sums, trace_ancestors
 from tests.marking import exactness
 
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
@@ -117,8 +111,8 @@ def test_what_follows_ancestors_refuses_particles_without_one_parent():
             jax.block_until_ready(jax.jit(follow)(run))
     with pytest.raises(ValueError, match=r"leaves no particle one parent.* smoothed_sums"):
         smoothed_sums(key, filter, seen, total, method="mcmc")
-    with pytest.raises(ValueError, match=r"leaves no particle one parent.* with_first"):
-        with_first_ancestors(filter)
+    with pytest.raises(ValueError, match=r"leaves no particle one parent.* with_eve"):
+        mpfjax.with_eve_indices(filter)
 
 
 @pytest.mark.exactness

@@ -10,7 +10,6 @@ import pytest
 import mpfjax
 from mpfjax import Filter, KMeans, Propagate, Resample
 from mpfjax.exact import kalman_filter
-from mpfjax.smoothing import with_first_ancestors
 from mpfjax.smoothing.variance import log_marginal_likelihood_variance, mixture_weight_errors
 from tests.marking import exactness, quick_of
 from tests.registry import RandomLabels
@@ -33,7 +32,7 @@ RANDOM_LABELS = RandomLabels()
 
 def labelled(model, n, ess_threshold=1.0, regrouping=RANDOM_LABELS, m=3):
     """Components, of random members if nothing else, which are resampled apart."""
-    moves = [Resample("multinomial", ess_threshold), Propagate(), regrouping]
+    moves = [Resample("multinomial", ess_threshold=ess_threshold), Propagate(), regrouping]
     return Filter(model, moves, n, m, initial_moves=[KMeans(3, reseed=True)])
 
 
@@ -50,7 +49,7 @@ SMALL = {
 def many(filter, observations, num_runs):
     """Many runs, log Ẑ and its variance from each."""
     keys = jax.random.split(jax.random.key(0), num_runs)
-    filter = with_first_ancestors(filter)
+    filter = mpfjax.with_eve_indices(filter)
     runs = mpfjax.monte_carlo(keys, filter, observations, nothing)
     variances = jax.vmap(log_marginal_likelihood_variance)(runs)
     return runs, np.asarray(runs.log_marginal_likelihood, float), np.asarray(variances, float)
@@ -108,7 +107,7 @@ def test_averages_of_pairs_are_close_to_the_pairs_themselves(num_components):
     filter = mpfjax.particle_filter(SQUARE, 80, **DRAWS)
     if num_components > 1:
         filter = labelled(SQUARE, 80, regrouping=KMeans())
-    keys, own = jax.random.split(jax.random.key(5), 40), with_first_ancestors(filter)
+    keys, own = jax.random.split(jax.random.key(5), 40), mpfjax.with_eve_indices(filter)
     runs = mpfjax.monte_carlo(keys, own, SQUARES)
     variances = jax.vmap(log_marginal_likelihood_variance)(runs)
     errors = np.asarray(jax.vmap(mixture_weight_errors)(runs))
@@ -123,7 +122,7 @@ def test_averages_of_pairs_are_close_to_the_pairs_themselves(num_components):
             assert np.corrcoef(ours, theirs)[0, 1] > 0.97
     plain = mpfjax.monte_carlo(keys, filter, SQUARES, nothing)
     np.testing.assert_array_equal(plain.final.particles, runs.final.particles)
-    assert len(with_first_ancestors(own).initial_moves) == len(filter.initial_moves) + 1
+    assert len(mpfjax.with_eve_indices(own).initial_moves) == len(filter.initial_moves) + 1
     last = jax.tree.map(lambda leaf: leaf[0], runs.final)
     moved, info = own.step(keys[0], last, SQUARES[0])
     np.testing.assert_allclose(info.mixture_weight_errors, mixture_weight_errors(moved), atol=1e-5)
@@ -133,7 +132,7 @@ def test_averages_of_pairs_are_close_to_the_pairs_themselves(num_components):
 
 @pytest.mark.exactness
 def test_one_step_nothing_seen_and_zero_likelihood():
-    filter = with_first_ancestors(mpfjax.particle_filter(SQUARE, 40, **DRAWS))
+    filter = mpfjax.with_eve_indices(mpfjax.particle_filter(SQUARE, 40, **DRAWS))
     one = mpfjax.run_filter(jax.random.key(1), filter, SQUARES[:1])
     assert np.isfinite(log_marginal_likelihood_variance(one))
     unseen = mpfjax.run_filter(jax.random.key(1), filter, np.full(3, np.nan), missing="skip")

@@ -39,7 +39,7 @@ def own(*moves):
     return lambda model: Filter(model, moves, NUM_PARTICLES)
 
 
-RESAMPLE = Resample("multinomial", 0.5)
+RESAMPLE = Resample("multinomial", ess_threshold=0.5)
 
 
 def pathwise(model):
@@ -110,7 +110,7 @@ def test_plain_derivatives_are_biased():
 
 MOVES = {
     "resampling": lambda gradient: Resample(ess_threshold=0.5, gradient=gradient),
-    "bootstrap": lambda gradient: Propagate(None, gradient),
+    "bootstrap": lambda gradient: Propagate(gradient=gradient),
     "guided": lambda gradient: Propagate(mpfjax.GaussNewtonProposal(), gradient),
     "halves": lambda gradient: Predict(gradient=gradient),
 }
@@ -143,8 +143,9 @@ def test_gradients_are_finite_where_weights_and_components_vanish():
     observations = jnp.array([1.5, 1.0, BLINDED, 0.4, 0.9])
 
     def log_evidence(model):
-        moves = [Resample("systematic", 0.7, 4, gradient="stop"), Propagate(None, "stop"),
-                 mpfjax.Merge(2.0, 1.0, patience=2)]  # fmt: skip
+        resample = Resample(ess_threshold=0.7, particles_per_component=4, gradient="stop")
+        moves = [resample, Propagate(gradient="stop"),
+                 mpfjax.Merge(2.0, max_distance=1.0, patience=2)]  # fmt: skip
         filter = Filter(model, moves, 24, 6, initial_moves=[mpfjax.RandomPartition()])
         run = mpfjax.run_filter(jax.random.key(6), filter, observations)
         seen = jnp.isfinite(run.log_likelihood_increments)

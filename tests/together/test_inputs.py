@@ -142,12 +142,12 @@ def nothing(mixture):
 def test_the_references_take_controls_and_matrices_by_time():
     model, inputs = in_matrices()
     log_z, filtered, smoothed = truth()
-    run = kalman_filter(model, OBSERVATIONS[:, None], inputs=inputs)
+    run = kalman_filter(model, mpfjax.Series(OBSERVATIONS[:, None], inputs))
     np.testing.assert_allclose(run.log_marginal_likelihood, log_z, atol=1e-5)
     np.testing.assert_allclose(run.means[:, 0], filtered, atol=1e-5)
     run = kalman_smoother(model, mpfjax.Series(OBSERVATIONS[:, None], inputs))
     np.testing.assert_allclose(run.means[:, 0], smoothed, atol=1e-5)
-    run = grid_filter(Driven(), OBSERVATIONS, jnp.linspace(-4.0, 5.0, 700), inputs=INPUTS)
+    run = grid_filter(Driven(), mpfjax.Series(OBSERVATIONS, INPUTS), jnp.linspace(-4.0, 5.0, 700))
     np.testing.assert_allclose(run.log_marginal_likelihood, log_z, atol=1e-4)
     np.testing.assert_allclose(run.means, filtered, atol=1e-4)
 

@@ -34,7 +34,7 @@ TRANSFORMS = {
     "look-ahead": mpfjax.with_lookahead,
     "two draws": lambda filter: mpfjax.with_proposals_per_particle(filter, 2),
     "start": lambda filter: mpfjax.with_selected_start(filter, 4),
-    "restarts": lambda filter: mpfjax.with_restarts(filter, PROBABILITY),
+    "restarts": lambda filter: mpfjax.with_restarts(filter, probability=PROBABILITY),
     "alarm": lambda filter: mpfjax.with_alarm(filter, 16),
     "stratified": lambda filter: mpfjax.with_resampling(filter, Resample("stratified")),
 }

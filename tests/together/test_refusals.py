@@ -344,13 +344,13 @@ REFUSED = (
     ("moves: .* never weigh the particles", lambda: Filter(MODEL, [Resample(), Predict()], 4)),
     ("scale: 2 units for 1 features",
      lambda: mpfjax.mixture_particle_filter(MODEL, 20, 2, scale=[1.0, 2.0]).init(KEY)),
-    ("share_by: groups have no effect",
-     lambda: Resample(particles_per_component=2, share_by=nothing)),
+    ("group: groups have no effect",
+     lambda: Resample(particles_per_component=2, group=nothing)),
     ("moves: (?s:.*) neither regroups, resamples nor",
      lambda: mpfjax.Every(2, [KMeans(), Propagate()])),
     ("moves: two of them keep the memory 'every 2: KMeans', as Every", lambda: FILTER.replace(
         moves=[*FILTER.moves, *(mpfjax.Every(2, [KMeans(k)]) for k in (1, 2))])),
-    ("function: it returned", lambda: mpfjax.GroupBy(lambda x: jnp.zeros(2, int))(KEY, MIXTURE)),
+    ("group: it returned", lambda: mpfjax.GroupBy(lambda x: jnp.zeros(2, int))(KEY, MIXTURE)),
     ("importance: .* draws from no proposal", lambda: mpfjax.gaussian_particle_filter(
         MODEL, 5, importance="predictive_gaussian", proposal=GUIDE)),
     ("slots: 3 is no whole number of at least N, 4",
@@ -494,8 +494,8 @@ REFUSED = (
     (r"function: shape \(\) has no leading axis",
      lambda: smoothing.smoothed_sums(**FILTERED, function=lambda previous, states: states.sum())),
     ("filter: .* is approximate or draws in a way of its own", lambda:
-        smoothing.with_first_ancestors(mpfjax.distributed_partitioned_sampling(JOINT, 4))),
-    (r"filter: scheme of \w+ is '", lambda: smoothing.with_first_ancestors(OF_SCALAR)),
+        mpfjax.with_eve_indices(mpfjax.distributed_partitioned_sampling(JOINT, 4))),
+    (r"filter: scheme of \w+ is '", lambda: mpfjax.with_eve_indices(OF_SCALAR)),
     ("run: its filter keeps no first", lambda: log_marginal_likelihood_variance(HISTORY)),
     ("runs: 1; a standard error asks for 4", lambda: batch_estimate(HISTORY, nothing)),
     # tuning
@@ -508,7 +508,7 @@ REFUSED = (
     ("draw, log_prior: .*exactly one", lambda: gibbs(log_prior=nothing)),
     (r"draw: a of shape \(2,\)", lambda: gibbs(lambda *given: {"a": TWO})),
     ("parameters: the value does not depend on h",
-     lambda: tuning.maximise(KEY, lambda key, model: model.a, SCALAR, ASCENT, 2)),
+     lambda: tuning.maximise(KEY, SCALAR, lambda key, model: model.a, ASCENT, 2)),
     ("transforms: b is not among", lambda: climb(transforms={"b": tuning.Positive()})),
     ("parameters: a, 0.9, is outside Interval",
      lambda: climb(transforms={"a": tuning.Interval(2.0, 3.0)})),

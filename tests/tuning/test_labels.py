@@ -86,15 +86,15 @@ def test_the_scale_has_a_best_value_and_a_factor_of_y_none():
     observations, labels, rivals = data(400, 60)
     objective = LabelLikelihood(observations, labels[1:], rivals)
     run = maximise(
-        jax.random.key(1), objective, Unnormalised(lambda_=0.2), optax.adam(0.1), 80,
+        jax.random.key(1), Unnormalised(lambda_=0.2), objective, optax.adam(0.1), 80,
         parameters={"lambda": lambda model: model.lambda_}, transforms={"lambda": Positive()},
         progress=False,
     )  # fmt: skip
     # Of 400 labels, its standard error is about 0.15.
     assert run.parameters["lambda"] == pytest.approx(0.5 / SIGMA**2, abs=0.6)
     assert run.value > run.history["value"][0] + 0.1
-    assert float(run.model.lambda_) == run.parameters["lambda"]
-    slope = jax.grad(lambda model: objective(jax.random.key(0), model))(run.model)
+    assert float(run.tuned.lambda_) == run.parameters["lambda"]
+    slope = jax.grad(lambda model: objective(jax.random.key(0), model))(run.tuned)
     assert abs(float(slope.c)) < 1e-4
     assert abs(float(slope.lambda_)) < 0.02
 
@@ -118,7 +118,7 @@ LAMBDA = {"parameters": {"lambda": lambda m: m.lambda_}, "progress": False}
 
 
 def ascent(objective=parabola, num_steps=60, **options):
-    arguments = (jax.random.key(0), objective, Unnormalised(), optax.sgd(0.1), num_steps)
+    arguments = (jax.random.key(0), Unnormalised(), objective, optax.sgd(0.1), num_steps)
     return maximise(*arguments, **LAMBDA | options)
 
 

@@ -83,9 +83,9 @@ def test_the_maximum_is_found_with_its_standard_errors():
     assert (np.abs(found - [a, r]) < 0.3 * slope * exact_error).all()
     errors = np.array([run.standard_errors["a"], run.standard_errors["r"]])
     np.testing.assert_allclose(errors, slope * exact_error, rtol=0.2)
-    assert run.log_marginal_likelihood == pytest.approx(float(log_evidence(best)), abs=2.0)
+    assert run.value == pytest.approx(float(log_evidence(best)), abs=2.0)
     assert run.stopped is None
-    assert float(run.filter.model.r) == pytest.approx(float(run.parameters["r"]))
+    assert float(run.tuned.model.r) == pytest.approx(float(run.parameters["r"]))
     assert run.history["r"].shape == (50,)
     assert run.history["r"][0] == pytest.approx(1.5)
 
@@ -138,7 +138,7 @@ class TestResuming:
         expected = 0.5 * np.exp(-step * np.arange(last))
         np.testing.assert_allclose(first.history["r"], expected, rtol=1e-5)
         assert first.parameters["r"] == pytest.approx(expected[-1])
-        assert np.isfinite(first.log_marginal_likelihood)
+        assert np.isfinite(first.value)
         before = (tmp_path / "fit.npz").read_bytes()
         with pytest.warns(UserWarning, match="was nan at step"):
             assert_same(short_fit(num_steps + 5, **options), first)
@@ -170,7 +170,7 @@ class TestResuming:
 def assert_same(run, other):
     """To the bit, and neither has taken a step more."""
     assert run.parameters["r"] == other.parameters["r"]
-    assert run.log_marginal_likelihood == other.log_marginal_likelihood
+    assert run.value == other.value
     assert run.stopped == other.stopped
     for name, values in other.history.items():
         np.testing.assert_array_equal(run.history[name], values)

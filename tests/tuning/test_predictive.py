@@ -47,7 +47,7 @@ def exact_moments():
         A=[[m.a, 1.0], [0.0, 1.0]], Q=np.diag([m.q**2, 0.0]), B=[[1.0], [0.0]],
         H=[[m.h, 0.0]], R=[[m.r**2]], m0=[m.m, 0.0], P0=np.diag([m.p**2, 1.0]),
     )  # fmt: skip
-    found = kalman_filter(model, SEEN[:, None], inputs=INPUTS[:, None], missing="skip")
+    found = kalman_filter(model, mpfjax.Series.skipping(SEEN[:, None], INPUTS[:, None]))
     mean, variance = np.asarray(found.means)[:, 0], np.asarray(found.covariances)[:, 0, 0]
     mean, variance = mean[-NUM_STEPS:], variance[-NUM_STEPS:]
     return [(mean, variance), (m.h * mean, m.h**2 * variance + m.r**2)]

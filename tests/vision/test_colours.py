@@ -29,7 +29,9 @@ def test_hue_saturation_and_value_are_matplotlibs(frame):
 
 def test_hsv_counts_by_colour_or_by_value(frame):
     """N_h N_s + N_v bins in one histogram, filled by a loop over the pixels."""
-    colours = HSVColours(5, 4, 3, least_saturation=0.3, least_value=0.4)
+    colours = HSVColours(
+        num_hues=5, num_saturations=4, num_values=3, least_saturation=0.3, least_value=0.4
+    )
     hue, saturation, value = np.moveaxis(rgb_to_hsv(frame / 255.0), -1, 0)
     expected = np.zeros(5 * 4 + 3)
     for h, s, v in zip(hue.ravel(), saturation.ravel(), value.ravel(), strict=True):

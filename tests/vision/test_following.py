@@ -65,7 +65,7 @@ def test_the_recipes_keep_to_objects_that_stand_still(name):
     for (x, y, w, h), colour in zip(boxes.astype(int), [(220, 10, 10), (10, 10, 220)], strict=True):
         still[y : y + h, x : x + w] = colour
     keys = jax.random.split(jax.random.key(0), 1)
-    snapshots = list(follow(PRESETS[name](still, boxes)["mpf"], keys, [still] * 3))
+    snapshots = list(follow(keys, PRESETS[name](still, boxes)["mpf"], [still] * 3))
     assert len(snapshots) == 3
     for snapshot in snapshots:
         means = snapshot.means[0][snapshot.active[0]]

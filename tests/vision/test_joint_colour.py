@@ -11,7 +11,7 @@ from mpfjax.vision.boxes.joint_colour import joint_colour_model
 from mpfjax.vision.colour.bins import HSVColours, RGBColours
 
 KEY = jax.random.key(0)
-COLOURS = HSVColours(4, 2, 2)
+COLOURS = HSVColours(num_hues=4, num_saturations=2, num_values=2)
 BOXES = np.array([[10.0, 10, 12, 20], [50, 20, 16, 24], [30, 40, 10, 12]])
 PAINTS = [(220, 20, 20), (20, 20, 220), (20, 200, 40)]
 

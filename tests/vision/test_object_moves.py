@@ -48,7 +48,7 @@ def test_hypotheses_of_one_object_do_not_exclude_each_other():
 
 def test_pruning_compares_within_an_object_only():
     rows = [(0, 0, 0.0, 0.5), (1, 0, 9.0, 5e-4), (2, 0, 9.0, 4e-3), (3, 1, 5.0, 1e-4)]
-    prune = Prune(least_share=2e-3, among=lambda states: states.reference)
+    prune = Prune(least_share=2e-3, group=lambda states: states.reference)
     moved = prune(jax.random.key(0), mixture_of(rows), NOW)
     assert moved.active.tolist() == [True, False, True, True]
     kept = np.asarray(moved.log_weights)[[0, 2, 3]]

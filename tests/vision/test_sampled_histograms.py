@@ -28,7 +28,11 @@ def one_by_one(frame, box, colours, rows, columns, num_parts):
     return counts
 
 
-@pytest.mark.parametrize("colours", [HSVColours(4, 2, 2), RGBColours(5)], ids=["hsv", "rgb"])
+@pytest.mark.parametrize(
+    "colours",
+    [HSVColours(num_hues=4, num_saturations=2, num_values=2), RGBColours(5)],
+    ids=["hsv", "rgb"],
+)
 @pytest.mark.parametrize("num_parts", [1, 3])
 def test_every_point_counts_once(colours, num_parts):
     shares = sampled_histograms(FRAME, BOXES, colours, num_parts)

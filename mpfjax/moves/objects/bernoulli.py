@@ -85,11 +85,11 @@ class Associate(AbstractWrapper):
     Raises `ValueError` on islands, for `slots`, and without slots for the objects.
     """
 
-    particles_per_birth: Count = eqx.field(static=True, default=50)
-    undetected_particles: Count = eqx.field(static=True, default=400)
-    least_existence: Share = eqx.field(static=True, default=1e-4)
-    resample: AbstractResampling = Resample()
-    resample_undetected: AbstractResampling = Resample()
+    particles_per_birth: Count = eqx.field(static=True, default=50, kw_only=True)
+    undetected_particles: Count = eqx.field(static=True, default=400, kw_only=True)
+    least_existence: Share = eqx.field(static=True, default=1e-4, kw_only=True)
+    resample: AbstractResampling = eqx.field(default=Resample(), kw_only=True)
+    resample_undetected: AbstractResampling = eqx.field(default=Resample(), kw_only=True)
 
     holds = ("resample", "resample_undetected")
     approximate = True

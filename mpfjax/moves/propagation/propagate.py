@@ -47,8 +47,8 @@ class _Propagation(AbstractPropagation):
     """x_t drawn by the model's own law or a proposal, and what it weighs."""
 
     proposal: AbstractProposal | None = None
-    gradient: Gradient = eqx.field(static=True, default="none")
-    noise: Noise = eqx.field(static=True, default="independent")
+    gradient: Gradient = eqx.field(static=True, default="none", kw_only=True)
+    noise: Noise = eqx.field(static=True, default="independent", kw_only=True)
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model that lacks what the arguments need."""
@@ -70,7 +70,7 @@ class _Propagation(AbstractPropagation):
             return predict(key, now.model, mixture, self.gradient, self.noise)
         if self.noise != "independent":
             dimension = self.noise_dimension(mixture, now)
-            noise = noise_of_slots(self.noise, key, dimension, mixture)
+            noise = noise_of_slots(key, self.noise, dimension, mixture)
             return self.from_noise(noise, mixture, now)
         if self.proposal is None:
             return self.weighed(predict(key, now.model, mixture, self.gradient), now)
@@ -231,13 +231,13 @@ class Reweight(AbstractPropagation):
 
 
 def noise_of_slots(
-    kind: str, key: Key[Array, ""], dimension: int, mixture: ParticleMixture
+    key: Key[Array, ""], kind: str, dimension: int, mixture: ParticleMixture
 ) -> Float[Array, "n k"]:
     """Noise for every slot; its points are those of the slot's component."""
     shape, dtype = (mixture.num_particles, dimension), noise_dtype(mixture.particles)
     labels, num_components = mixture.component_indicators, mixture.num_components
     shuffle = not mixture.in_order
-    return draw_noise(kind, key, shape, dtype, labels, num_components, shuffle)
+    return draw_noise(key, kind, shape, dtype, labels, num_components, shuffle)
 
 
 def predict(
@@ -251,7 +251,7 @@ def predict(
     states = mixture.particles
     # The noise may be that of a proposal alone.
     if noise != "independent" and (is_mixed(model) or is_made_of_noise(model)):
-        numbers = noise_of_slots(noise, key, noise_dimension(model, states), mixture)
+        numbers = noise_of_slots(key, noise, noise_dimension(model, states), mixture)
         draws = made_of(model, numbers, states)
     else:
         draws = drawn(key, model, states)

@@ -95,8 +95,8 @@ class PropagateRegimes(AbstractPropagation):
     mass, and Ẑ is unbiased. A `Resample` before it would only add noise: `Filter(model,
     [PropagateRegimes()], N)` is the whole filter.
 
-    - `group`: a `GroupBy` that regroups the children before the choice; None leaves them in their
-      parents' components. With a group by the regime, every regime has its share of the slots at
+    - `regroup`: a `GroupBy` that regroups the children before the choice; None leaves them in their
+      parents' components. Regrouped by the regime, every regime has its share of the slots at
       every step, however improbable it is: the IMM particle filter (Blom and Bloem 2007) with
       Kalman filters for particles.
 
@@ -106,10 +106,10 @@ class PropagateRegimes(AbstractPropagation):
     is not conditionally linear, or has no `all_transitions`. Use it where K is small.
     """
 
-    group: GroupBy | None = None
+    regroup: GroupBy | None = None
 
     keeps_families = False
-    """it resamples without a memory of first ancestors."""
+    """it resamples without a memory of Eve indices."""
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for another model."""
@@ -147,8 +147,8 @@ class PropagateRegimes(AbstractPropagation):
         self, key: Key[Array, ""], mixture: ParticleMixture, family: ParticleMixture, model: Any
     ) -> ParticleMixture:
         """N of the N K children, their moments predicted."""
-        if self.group is not None:
-            family = self.group(key, family)
+        if self.regroup is not None:
+            family = self.regroup(key, family)
         line = in_line(jax.lax.stop_gradient(family))
         targets = Resample().deal(mixture, line, family.active)
         # More slots than children are of no use: a copy would have the moments that it copies.

@@ -63,10 +63,13 @@ class PropagateTempered(AbstractPropagation, AbstractWrapper):
 
     resample: Resample = eqx.field(default_factory=Resample)
     exponents: Annotated[tuple[float, ...], _RISING] = eqx.field(
-        converter=to_numbers("exponents"), static=True, default=(1 / 64, 1 / 16, 1 / 4, 1.0)
+        converter=to_numbers("exponents"),
+        static=True,
+        default=(1 / 64, 1 / 16, 1 / 4, 1.0),
+        kw_only=True,
     )
-    num_moves: Count = eqx.field(static=True, default=1)
-    least_step: InnerShare = eqx.field(static=True, default=0.02)
+    num_moves: Count = eqx.field(static=True, default=1, kw_only=True)
+    least_step: InnerShare = eqx.field(static=True, default=0.02, kw_only=True)
 
     holds = ("resample",)
 

@@ -42,7 +42,7 @@ class Merge(AbstractRegrouping, ByFeatures):
     """
 
     max_deviations: Positive | None = eqx.field(static=True, default=1.0)
-    max_distance: Positive | None = eqx.field(static=True, default=None)
+    max_distance: Positive | None = eqx.field(static=True, default=None, kw_only=True)
     patience: Count = eqx.field(static=True, default=1, kw_only=True)
 
     def __check_init__(self) -> None:
@@ -110,8 +110,8 @@ class Prune(AbstractMove):
     With M components, a step loses at most the share (M - 1) `least_share` of the mass, and Ẑ falls
     by at most as much.
 
-    - `among`: a function that gives each particle the whole number of its group, the same within a
-      component, as `share_by` of `Resample` does. A component is then compared with the heaviest of
+    - `group`: a function that gives each particle the whole number of its group, the same within a
+      component, as that of `Resample` does. A component is then compared with the heaviest of
       its group: hypotheses about one object of several, whose odds their masses are. None compares
       all.
 
@@ -120,7 +120,7 @@ class Prune(AbstractMove):
     """
 
     least_share: InnerShare = eqx.field(static=True, default=1e-6)
-    among: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(static=True, default=None)
+    group: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(static=True, default=None)
 
     approximate = True
     """the mass of the pruned components is lost."""
@@ -136,8 +136,8 @@ class Prune(AbstractMove):
             return mixture
         masses = mixture.log_mixture_weights
         heaviest = jnp.max(masses)
-        if self.among is not None:
-            groups = component_groups(mixture, self.among(mixture.particles))
+        if self.group is not None:
+            groups = component_groups(mixture, self.group(mixture.particles))
             is_rival = groups[:, None] == groups[None]
             heaviest = jnp.max(jnp.where(is_rival, masses[None], -jnp.inf), axis=1)
         hopeless = masses < heaviest + jnp.log(self.least_share)

@@ -71,7 +71,7 @@ class GroupBy(AbstractRegrouping):
     particles even while it is improbable. For regimes this is the IMM particle filter (Blom and
     Bloem 2007).
 
-    - `function`: gives the label of each particle, (n,): whole numbers in [0, M), where M is the
+    - `group`: gives the label of each particle, (n,): whole numbers in [0, M), where M is the
       filter's `num_components`, or True and False for 1 and 0. A function of the particles, as
       `lambda states: states["room"]`.
 
@@ -80,7 +80,7 @@ class GroupBy(AbstractRegrouping):
     where you know what the modes are, and `KMeans`, `Merge` and `Split` where you do not.
     """
 
-    function: Callable[[PyTree], Int[Array, " n"] | Bool[Array, " n"]] = eqx.field(static=True)
+    group: Callable[[PyTree], Int[Array, " n"] | Bool[Array, " n"]] = eqx.field(static=True)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
@@ -93,16 +93,16 @@ class GroupBy(AbstractRegrouping):
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The label of every particle; that of an empty slot is moved into [0, M)."""
-        with saying("function of GroupBy", "called with the particles"):
-            labels: Any = self.function(mixture.particles)
+        with saying("group of GroupBy", "called with the particles"):
+            labels: Any = self.group(mixture.particles)
         n, dtype = mixture.num_particles, getattr(labels, "dtype", float)
         if dtype == jnp.bool_:
             labels, dtype = labels.astype(jnp.int32), jnp.int32
         if jnp.shape(labels) != (n,) or not jnp.issubdtype(dtype, jnp.integer):
             what = f"not one whole number a particle, ({n},)"
-            raise ValueError(f"function: it returned {shown(labels)}, {what}")
+            raise ValueError(f"group: it returned {shown(labels)}, {what}")
         m = mixture.num_components
         outside = mixture.occupied & ((labels < 0) | (labels >= m))
         inside = jnp.clip(labels, 0, m - 1).astype(jnp.int32)
-        message = f"GroupBy: function gave a label outside [0, {m}), the filter's num_components"
+        message = f"GroupBy: group gave a label outside [0, {m}), the filter's num_components"
         return eqx.error_if(inside, jnp.any(outside), message), mixture.memory

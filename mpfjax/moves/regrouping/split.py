@@ -46,7 +46,7 @@ class Split(AbstractRegrouping, ByFeatures):
     """
 
     min_deviations: NotNegative = eqx.field(static=True, default=4.0)
-    min_distance: NotNegative = eqx.field(static=True, default=0.0)
+    min_distance: NotNegative = eqx.field(static=True, default=0.0, kw_only=True)
     min_share: Annotated[float, share(0.5)] = eqx.field(static=True, default=0.05, kw_only=True)
     num_iterations: Count = eqx.field(static=True, default=3, kw_only=True)
     sample_size: Count | None = eqx.field(static=True, default=32, kw_only=True)

@@ -44,11 +44,11 @@ class GaussianRegeneration(AbstractResampling):
     that is not positive, an unknown noise or particles_per_component < 1.
     """
 
-    particles_per_component: Count | None = eqx.field(static=True, default=None)
-    where: Callable[[PyTree], PyTree] | None = eqx.field(static=True, default=None)
-    inflation: Positive = eqx.field(static=True, default=1.0)
+    particles_per_component: Count | None = eqx.field(static=True, default=None, kw_only=True)
+    where: Callable[[PyTree], PyTree] | None = eqx.field(static=True, default=None, kw_only=True)
+    inflation: Positive = eqx.field(static=True, default=1.0, kw_only=True)
     noise: Literal["independent", "stratified", "rqmc"] = eqx.field(
-        static=True, default="independent"
+        static=True, default="independent", kw_only=True
     )
 
     approximate = True
@@ -111,7 +111,7 @@ class GaussianRegeneration(AbstractResampling):
         factors = self.inflation * cholesky(moments.covariances)
         factors = spread(factors, vacated.component_indicators)
         labels, num_components = vacated.component_indicators, mixture.num_components
-        noise = draw_noise(self.noise, key, states.shape, states.dtype, labels, num_components)
+        noise = draw_noise(key, self.noise, states.shape, states.dtype, labels, num_components)
         offsets = jnp.einsum("nij,nj->ni", factors, noise)
         means = spread(moments.means, vacated.component_indicators)
         unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], chosen))[1]

@@ -45,12 +45,12 @@ class Resample(AbstractResampling):
       resampled, as `allocation` says. A number k gives each living component k particles and
       leaves the other slots empty, as section 5.2 of the paper does.
     - `allocation`: how the components share the slots, where neither `particles_per_component` nor
-      `share_by` says it. "variance" deals component m a number in proportion to the root of
+      `group` says it. "variance" deals component m a number in proportion to the root of
       k_m Σ_{c_i = m} exp 2ℓ_i, or of π_m^2 k_m / ESS_m, which leaves Ẑ the least variance
       (Neyman 1934), and shares a quarter to a half equally, so that every mode stays alive (see
       docs/masses.md). "equal" is the paper's: it keeps modes of little mass longest, and log Ẑ is
       less exact.
-    - `share_by`: a function that gives each particle the whole number of its group, the same within
+    - `group`: a function that gives each particle the whole number of its group, the same within
       a component. Groups with a component that is resampled share the slots equally, and so do the
       components within a group. None makes no groups. Use it where components are rival hypotheses
       about several objects, so that an object with many does not take the slots of the others.
@@ -72,20 +72,22 @@ class Resample(AbstractResampling):
       none, since regrouping does not change the distribution.
 
     Raises `ValueError` for an unknown scheme or gradient or allocation, a threshold outside [0, 1],
-    k < 1, and k together with `share_by`.
+    k < 1, and k together with `group`.
     """
 
     scheme: Scheme = eqx.field(static=True, default="systematic")
-    ess_threshold: Share = eqx.field(static=True, default=1.0)
-    particles_per_component: Count | None = eqx.field(static=True, default=None)
-    sort_by: SortBy | None = eqx.field(static=True, default=None)
-    gradient: Gradient = eqx.field(static=True, default="none")
-    allocation: Allocation = eqx.field(static=True, default="variance")
-    share_by: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(static=True, default=None)
+    ess_threshold: Share = eqx.field(static=True, default=1.0, kw_only=True)
+    particles_per_component: Count | None = eqx.field(static=True, default=None, kw_only=True)
+    sort_by: SortBy | None = eqx.field(static=True, default=None, kw_only=True)
+    gradient: Gradient = eqx.field(static=True, default="none", kw_only=True)
+    allocation: Allocation = eqx.field(static=True, default="variance", kw_only=True)
+    group: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(
+        static=True, default=None, kw_only=True
+    )
 
     def __check_init__(self) -> None:
-        if self.share_by is not None and self.particles_per_component is not None:
-            raise ValueError("share_by: groups have no effect beside particles_per_component")
+        if self.group is not None and self.particles_per_component is not None:
+            raise ValueError("group: groups have no effect beside particles_per_component")
 
     @property
     def biases_score(self) -> bool:
@@ -93,7 +95,7 @@ class Resample(AbstractResampling):
         return self.gradient == "none" and self.ess_threshold > 0
 
     keeps_families = True
-    """it updates the memory of first ancestors."""
+    """it updates the memory of Eve indices."""
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for fewer slots than each component is to have."""
@@ -179,8 +181,8 @@ class Resample(AbstractResampling):
     ) -> Int[Array, " m"]:
         """How many slots each component gets; those in line that are not `due` keep theirs."""
         num_slots, demands = mixture.num_usable_slots, None
-        if self.share_by is not None:
-            demands = demands_of_groups(mixture, self.share_by(mixture.particles), due)
+        if self.group is not None:
+            demands = demands_of_groups(mixture, self.group(mixture.particles), due)
         elif self.allocation != "equal" and mixture.num_components > 1:
             demands = demands_by_variance(
                 line.log_masses, line.effective_sample_sizes, line.counts, due, num_slots

@@ -45,7 +45,7 @@ class Snapshot(NamedTuple):
 
 @checked
 def follow(
-    filter: Filter, keys: Key[Array, " runs"], frames: Iterable[UInt8[np.ndarray, "h w 3"]]
+    keys: Key[Array, " runs"], filter: Filter, frames: Iterable[UInt8[np.ndarray, "h w 3"]]
 ) -> Iterator[Snapshot]:
     """Run a filter of boxes online, once for each key, and yield a snapshot for each frame.
 
@@ -58,13 +58,13 @@ def follow(
     for t, frame in enumerate(frames):
         step = jnp.asarray(t)  # an array: a new Python number would compile again
         mixtures, snapshot, faults = _advance(
-            filter, keys, step, mixtures, jnp.asarray(one_observation(frame))
+            keys, filter, step, mixtures, jnp.asarray(one_observation(frame))
         )
         yield jax.tree.map(np.asarray, raise_faults(snapshot, faults))
 
 
 @eqx.filter_jit
-def _advance(filter, keys, t, mixtures, frame):
+def _advance(keys, filter, t, mixtures, frame):
     def step(key, mixture):
         step_key = jax.random.fold_in(key, t)
         mixture, _, faults = filter._step_and_faults(step_key, mixture, frame)

@@ -120,9 +120,9 @@ class ObjectExclusion(AbstractExclusion):
     true). Use it after `Propagate`, where look-alikes cross.
     """
 
-    strength: float = eqx.field(static=True, default=3.0)
-    radius: float = eqx.field(static=True, default=0.5)
-    scale: tuple[float, float] = eqx.field(static=True, default=(1.0, 1.0))
+    strength: float = eqx.field(static=True, default=3.0, kw_only=True)
+    radius: float = eqx.field(static=True, default=0.5, kw_only=True)
+    scale: tuple[float, float] = eqx.field(static=True, default=(1.0, 1.0), kw_only=True)
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Lower the weight of every particle according to its distance from the other objects."""

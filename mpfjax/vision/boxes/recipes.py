@@ -47,7 +47,8 @@ def paper_filters(
     size = boxes[:, 2:].mean(axis=0)
     model = ColourModel.from_frame(frame, boxes, sigma=0.15, share_reference=True)
     where: dict[str, Any] = {"features": _centre, "scale": size}
-    merge, split = Merge(None, 0.5, **where), Split(4.0, 0.5, min_share=0.15, **where)
+    merge = Merge(None, max_distance=0.5, **where)
+    split = Split(4.0, min_distance=0.5, min_share=0.15, **where)
     where |= {"regroup": [merge, split, KMeans(5, **where)], "regroup_every": 1}
     mixture = mixture_particle_filter(model, NUM_PARTICLES, MAX_COMPONENTS, **where)
     mixture = with_resampling(mixture, Resample(particles_per_component=PARTICLES_PER_COMPONENT))
@@ -77,15 +78,15 @@ def default_filters(
             Resample(particles_per_component=PARTICLES_PER_COMPONENT),
             Propagate(),
             Exclusion(strength=4.0, radius=0.5, **where),
-            Merge(None, 0.25, patience=10, **where),
-            Split(4.0, 0.5, min_share=0.15, **where),
+            Merge(None, max_distance=0.25, patience=10, **where),
+            Split(4.0, min_distance=0.5, min_share=0.15, **where),
         ],
         num_particles=NUM_PARTICLES,
         num_components=MAX_COMPONENTS,
         # One component for each box.
         initial_moves=[
             KMeans(10, reseed=True, **_apart(size)),
-            Merge(None, 0.5, features=_reference),
+            Merge(None, max_distance=0.5, features=_reference),
         ],
     )
     return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
@@ -121,13 +122,13 @@ def objects_filters(
     mixture = Filter(
         model,
         moves=[
-            Resample(share_by=_object),
+            Resample(group=_object),
             Propagate(),
             *([exclusion] if len(boxes) > 1 else []),
             learn,
-            Merge(None, 0.25, patience=10, **apart),
-            Prune(least_share=1e-15, among=_object),
-            Split(4.0, 0.5, min_share=0.05, sample_size=None, **apart),
+            Merge(None, max_distance=0.25, patience=10, **apart),
+            Prune(least_share=1e-15, group=_object),
+            Split(4.0, min_distance=0.5, min_share=0.05, sample_size=None, **apart),
         ],
         num_particles=num_particles,
         num_components=num_components,

@@ -63,11 +63,11 @@ class HSVColours(AbstractColours):
     Raises `ValueError` for a number of bins below 1 and thresholds outside [0, 1].
     """
 
-    num_hues: Count = eqx.field(static=True, default=10)
-    num_saturations: Count = eqx.field(static=True, default=10)
-    num_values: Count = eqx.field(static=True, default=10)
-    least_saturation: Share = eqx.field(static=True, default=0.1)
-    least_value: Share = eqx.field(static=True, default=0.2)
+    num_hues: Count = eqx.field(static=True, default=10, kw_only=True)
+    num_saturations: Count = eqx.field(static=True, default=10, kw_only=True)
+    num_values: Count = eqx.field(static=True, default=10, kw_only=True)
+    least_saturation: Share = eqx.field(static=True, default=0.1, kw_only=True)
+    least_value: Share = eqx.field(static=True, default=0.2, kw_only=True)
 
     @property
     def num_channels(self) -> int:

@@ -33,7 +33,7 @@ from mpfjax.vision.tracking.noise import NoiseState
 from mpfjax.vision.tracking.scores import STRONG, WEAK, ScoreState
 from mpfjax.vision.tracking.state import TrackerState, Tracks
 
-_COLOURS, _BANDS = HSVColours(8, 4, 6), 3
+_COLOURS, _BANDS = HSVColours(num_hues=8, num_saturations=4, num_values=6), 3
 # Of a weak detection, of an object that is not confirmed, and of one of another class.
 _WEAK_COST, _DOUBT_COST, _CLASS_COST = 8.0, 2.0, 8.0
 WEAK_ERROR = 1.35  # times the error of a strong detection

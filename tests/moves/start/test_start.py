@@ -9,7 +9,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.smoothing import conditional_filter, sample_trajectories, with_first_ancestors
+from mpfjax.smoothing import conditional_filter, sample_trajectories
 from tests.moves.start.test_window import PLANE, WithKeys
 from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, truth
 from tests.unbiased import assert_unbiased, ratios_to
@@ -111,7 +111,7 @@ def test_trajectories_are_drawn_backwards_and_ancestors_refused():
 
     assert_unbiased(smooth(jax.random.split(KEY, 40)), truth()[2], loosest=0.05, slack=0.02)
     with pytest.raises(ValueError, match="one parent"):
-        with_first_ancestors(filter)
+        mpfjax.with_eve_indices(filter)
     with pytest.raises(ValueError, match="cannot keep a trajectory"):
         conditional_filter(KEY, filter, series, jnp.zeros(len(OBSERVATIONS) + 1))
 
@@ -151,8 +151,8 @@ def test_restarts_begin_after_the_first_steps():
     """In either order; they are so rare here that the exact answer is that without them."""
     exact = kalman_filter(PLANE, SEEN)
     both = (
-        mpfjax.with_restarts(FILTER, 1e-6),
-        mpfjax.with_start(mpfjax.with_restarts(PLAIN, 1e-6), LENGTH),
+        mpfjax.with_restarts(FILTER, probability=1e-6),
+        mpfjax.with_start(mpfjax.with_restarts(PLAIN, probability=1e-6), LENGTH),
     )
     for filter in both:
         runs = mpfjax.monte_carlo(jax.random.split(KEY, 200), filter, SEEN, mean)
