@@ -97,7 +97,8 @@ GOOD = {
     **alike({"filter": FILTER}, mpfjax.with_lookahead, mpfjax.with_point_sets,
             mpfjax.with_score_gradient, mpfjax.with_start),
     **alike({"filter": FILTER, "num_draws": 2}, mpfjax.with_selected_start,
-            mpfjax.with_proposals_per_particle, mpfjax.with_restarts, mpfjax.with_alarm),
+            mpfjax.with_proposals_per_particle, mpfjax.with_restarts),
+    mpfjax.with_alarm: {"filter": FILTER, "num_particles": 2},
     **alike({"model": MODEL, "num_particles": 4}, mpfjax.particle_filter,
             mpfjax.gaussian_particle_filter),
     **alike({"model": MODEL, "num_particles": 4, "max_components": 2},
@@ -128,11 +129,14 @@ GOOD = {
     mpfjax.AuxiliaryResample: {"resample": Resample(), "lookahead": GUIDE},
     mpfjax.Merge: {"max_distance": 2.0},
     mpfjax.RandomPartition: {"num_sets": 2},
-    mpfjax.GroupBy: {"function": nothing},
-    mpfjax.Every: {"num_steps": 2, "moves": [KMeans(1)]},
+    mpfjax.GroupBy: {"group": nothing},
+    mpfjax.Every: {"every": 2, "moves": [KMeans(1)]},
     mpfjax.PropagateNested: {"propagate": Propagate(), "num_draws": 2},
     mpfjax.PropagateTempered: {"resample": Resample(), "exponents": (0.1, 1.0)},
     SelectInitial: {"num_draws": 2},
+    mpfjax.RegroupOthers: {"regrouping": KMeans(1)},
+    mpfjax.with_eve_indices: {
+        "filter": mpfjax.particle_filter(MODEL, 4, scheme="multinomial")},
     Filter: {"model": MODEL, "moves": [Propagate()], "num_particles": 4},
     mpfjax.with_resampling: {"filter": FILTER, "resample": Resample()},
     mpfjax.auxiliary_particle_filter: {"model": MODEL, "num_particles": 4, "lookahead": GUIDE},
@@ -496,7 +500,7 @@ REFUSED = (
     ("filter: .* is approximate or draws in a way of its own", lambda:
         mpfjax.with_eve_indices(mpfjax.distributed_partitioned_sampling(JOINT, 4))),
     (r"filter: scheme of \w+ is '", lambda: mpfjax.with_eve_indices(OF_SCALAR)),
-    ("run: its filter keeps no first", lambda: log_marginal_likelihood_variance(HISTORY)),
+    ("run: its filter keeps no Eve", lambda: log_marginal_likelihood_variance(HISTORY)),
     ("runs: 1; a standard error asks for 4", lambda: batch_estimate(HISTORY, nothing)),
     # tuning
     (r"num_samples: 800 .* num_moves \+ 1: 798 or 804", lambda: tuning.smc2(
