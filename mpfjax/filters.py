@@ -316,17 +316,19 @@ def bernoulli_filter(
     """An unknown number of objects that come and go: predict, associate.
 
     A Poisson multi-Bernoulli filter (Williams 2015) in particles. Each of `max_targets` components
-    is an object that exists with some probability, and one more holds the intensity of those that
-    no measurement has revealed; `targets` tells them, and `Associate` how it works and what the
-    last three arguments are. All share `num_particles`: let there be a hundred or more for each
-    object, beside those undetected. Let `max_targets` be more than there are measurements in a scan
-    where objects may appear anywhere.
+    is an object that exists with some probability. One more component holds the intensity of the
+    objects that no measurement has revealed. `targets` reads the objects out. `Associate` says how
+    the filter works, and what the last three arguments are.
 
-    The default draws each object from its Gaussian, so that a few particles do. With `Resample()`
-    it has any shape, but all its particles descend from the `particles_per_birth` it began with, of
-    which there must then be many. Use it with a `TargetsModel`, where neither the number of objects
-    nor which measurement is whose is known; for one object a filter with `ClutteredModel`, for
-    boxes in a video `vision.ObjectTracker`.
+    - `num_particles`: of all objects together: `undetected_particles`, and a hundred or more for
+      each object.
+    - `max_targets`: more than the measurements of a scan, where objects may appear anywhere.
+
+    By default each object is drawn anew from its Gaussian, for which a few particles are enough.
+    With `Resample()` it may have any shape. But then all its particles descend from the
+    `particles_per_birth` that it began with, so that there must be many of these. Use it with a
+    `TargetsModel`, if neither the number of objects nor which measurement is whose is known. For
+    one object take a filter with `ClutteredModel`, for boxes in a video `vision.ObjectTracker`.
     """
     resample = GaussianRegeneration() if resample is None else resample
     associate = Associate(

@@ -68,8 +68,8 @@ class ParticleMixture(eqx.Module):
     - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
     - `component_indicators`: C, shape (n,), in [0, num_components).
     - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from,
-      -1 for a particle that came from no single one (`AbstractMove.keeps_parents`). Among others
-      that did, it is one that began anew; see `began_anew`.
+      -1 where it came from no single one (`AbstractMove.keeps_parents`). If only some are -1, their
+      states began anew; see `began_anew`.
     - `num_components`: M, the most components that there can be, dead ones included; static. The
       filters of the literature call it `max_components`.
     - `memory`: the memory that moves keep from step to step, by the move's name.
@@ -82,9 +82,9 @@ class ParticleMixture(eqx.Module):
     - `log_scale`: the logarithm of a common factor of all weights. It is kept apart from ℓ, which
       would lose its digits if a log-likelihood of a million were added. After a step it is zero.
       In a mixture of x_0 it is what the initial moves leave to the first increment.
-    - `waits`: whether x_0 was chosen by the first observation and weighs the inverse, so that no
-      resampling is due before that observation has weighed x_1 too: it would undo the choice. None
-      where no initial move weighs.
+    - `waits`: whether resampling waits for the first observation. If this chose x_0, the weights
+      are the inverse of the choice until it has weighed x_1 too, and resampling before would undo
+      the choice. None if no initial move weighs.
     - `periods`: of a model that has them, in the form of one state, so that means and covariances
       are those on a circle. Within a step it is None.
 

@@ -61,7 +61,7 @@ def _require_resample(filter: Filter, what: str) -> None:
 
 @checked
 def with_resampling(filter: Filter, resample: Resample) -> Filter:
-    """The filter with this `Resample` in the place of the chain's own, looking ahead as they did.
+    """The filter with this `Resample` in the place of its own; look-aheads stay.
 
     Raises `ValueError` for anything but a `Resample`. Use it for other slots of components:
     `with_resampling(filter, Resample(allocation="equal"))`.

@@ -41,7 +41,7 @@ class AbstractBirth(eqx.Module):
 
 
 class GaussianBirth(AbstractBirth, Fitting):
-    """New objects with the x_0 ~ N(m0, P0) of a linear model; at a measurement, x_0 given it.
+    """New objects with x_0 ~ N(m0, P0) of a linear model; near a measurement, x_0 given it.
 
     Raises `ValueError` for a rate that is not positive. Use it with a wide P0 where objects may
     appear anywhere.

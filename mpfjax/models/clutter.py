@@ -57,11 +57,11 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
 
     Each observation has room for K measurements, leaves (K, ...): rows with a NaN are none, and a
     step without any says that the object was missed. A step in which the sensor was off is one that
-    is missing, see `Series`. Everything else is the object's model's, without what is about a
-    single measurement, as `observation_mean` for `GaussNewtonProposal`. Raises `ValueError` for
-    numbers outside of these, and for a conditionally linear model: draw regimes with the state, and
-    `GroupBy` them. Use it for an object among false alarms; before several objects, two may claim
-    one measurement.
+    is missing, see `Series`. The object's model gives everything else, but for what is about a
+    single measurement: there is no `observation_mean`, and so no `GaussNewtonProposal`. Raises
+    `ValueError` for numbers outside of these, and for a conditionally linear model: draw regimes
+    with the state, and `GroupBy` them. Use it for one object among false alarms. Two objects would
+    claim the same measurement; for several take `TargetsModel`.
     """
 
     object_model: AbstractStateSpaceModel

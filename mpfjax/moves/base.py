@@ -295,7 +295,7 @@ def _of_inner(together: Callable[..., bool], name: str) -> Any:
 
 
 class AbstractWrapper(AbstractMove):
-    """A move that holds moves, and is what they are wherever it does not say otherwise.
+    """A move that holds moves; what it does not define itself is as they have it.
 
     The class names the fields that hold them: `holds = ("moves",)`, each a move or a tuple of
     moves. Transforms of filters reach all moves by these names.

@@ -58,15 +58,15 @@ def sample_initial(
 class SelectInitial(AbstractMove):
     """An initial move that draws x_0 many times, and keeps the draws that y_1 speaks for.
 
-    K N draws of x_0 take the place of the mixture's N. From each, x_1 is drawn twice, and ν is the
-    mean of the two likelihoods of y_1, shrunk towards the mean of all by the share of its variance
-    that is not x_0's (`trusted`). N particles are kept with probabilities in proportion to ν, and
-    weigh 1 / ν, so that they represent x_0 as all draws do. Their mass is part of the first
-    increment, and Ẑ stays unbiased. A wide prior is covered as by K N particles, at the cost of
-    2 K more draws of x_1 in the whole run.
+    K N draws of x_0 take the place of the mixture's N. From each, x_1 is drawn twice. ν is the mean
+    of the two likelihoods of y_1, shrunk towards the mean over all draws: the less the two
+    likelihoods of a draw agree, the less they tell of x_0 (`trusted`). N draws are kept with
+    probabilities in proportion to ν, and weigh 1 / ν, so that they represent x_0 as all draws do.
+    Their mass is part of the first increment, and Ẑ stays unbiased. A wide prior is covered as by
+    K N particles, at the cost of 2 K more draws of x_1 in the whole run.
 
-    Without an observation it does nothing. Where an initial move weighs x_0, the chain's `Resample`
-    waits for y_1: it would undo the choice.
+    Without an observation it does nothing. After it the chain's `Resample` waits for y_1, since it
+    would undo the choice.
 
     The filter's own propagation draws x_1, and weighs it.
 

@@ -26,10 +26,10 @@ from mpfjax.running.storage import (
 class Checkpoint(Checked):
     """The file from which a long run goes on: `fit`, `maximise`, and the samplers of parameters.
 
-    - `path`: a .npz file, without pickles. If it exists, the same call goes on from it, the same to
-      the bit as without the interruption; also to more steps, or more observations.
+    - `path`: a .npz file, without pickles. If it exists, the same call goes on from it, and gives the
+      bits of a run without interruption. The call may ask for more steps or more observations.
     - `every`: after how many steps it is written. It is also written when the run ends, fails or is
-      interrupted. After an interruption of the writing it is the old file or the new one.
+      interrupted. If the writing itself is interrupted, the old file stays.
     - `name`: what the run is called, such as "adam, cosine". Its file is then recognised by this
       name and by the data and numbers of the call, and no longer by the program that JAX makes of
       the functions, such as a prior or an optimiser, which another version of JAX may change.

@@ -54,10 +54,10 @@ class Associate(AbstractWrapper):
 
     A Poisson multi-Bernoulli filter (Williams 2015) in particles, with the marginal probabilities
     of associations by belief propagation (Williams and Lau 2014; Meyer et al. 2018). The joint
-    weights are the intensity of the objects, normalised: times the expected number, which the
-    memory holds, those of component m >= 1 sum to the probability r_m that its object exists, and
-    those of component 0 to the expected number of objects that no measurement has revealed yet.
-    After a `Predict`, with u the intensity at a particle, G_j its p_D N(y_j | x) / λ(y_j),
+    weights are the intensity u of the objects, normalised. Multiply them by the expected number of
+    objects, which the memory holds, to have u. The u of component m >= 1 sum to the probability r_m
+    that its object exists, those of component 0 to the expected number of objects that no
+    measurement has revealed yet. After a `Predict`, with G_j = p_D N(y_j | x) / λ(y_j),
 
     1. u is multiplied by p_S, and new objects join component 0.
     2. Each measurement may be the first of an object, whose particles are drawn ∝ G_j u from
@@ -69,12 +69,11 @@ class Associate(AbstractWrapper):
        (Williams 2012).
     5. Each component is resampled, by `resample`.
 
-    The mass grows by log p of the scan over that of clutter alone, as `ClutteredModel` has it, in
-    Bethe's approximation, which is exact where no two objects compete for two measurements. It is
-    the only approximation together with step 4 and with the product form after each scan
-    (`approximate`). Labels count objects up from 1; they are not identities once two objects have
-    been close, whoever computes them. `memory["targets"]` holds the number, the labels, and how
-    many objects were crowded out.
+    The mass grows by log p of the scan over that of clutter alone, as `ClutteredModel` has it. Three
+    things are approximate: belief propagation, whose log p is Bethe's, and exact where no two
+    objects compete for two measurements; step 4; and the product form after each scan. Labels count
+    objects up from 1. They are not identities once two objects have been close, whoever computes
+    them. `memory["targets"]` holds the number, the labels, and how many objects were crowded out.
 
     - `particles_per_birth`: the particles of a new object at each measurement.
     - `undetected_particles`: those of component 0, which fill the first slots.
