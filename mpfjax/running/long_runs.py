@@ -26,8 +26,8 @@ from mpfjax.running.storage import (
 class Checkpoint(Checked):
     """The file from which a long run goes on: `fit`, `maximise`, and the samplers of parameters.
 
-    - `path`: a .npz file, without pickles. If it exists, the same call goes on from it, and gives the
-      bits of a run without interruption. The call may ask for more steps or more observations.
+    - `path`: a .npz file, without pickles. If it exists, the same call goes on from it, with the
+      result of a run without interruption, to the bit. It may ask for more steps or observations.
     - `every`: after how many steps it is written. It is also written when the run ends, fails or is
       interrupted. If the writing itself is interrupted, the old file stays.
     - `name`: what the run is called, such as "adam, cosine". Its file is then recognised by this

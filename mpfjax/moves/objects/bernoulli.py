@@ -69,8 +69,8 @@ class Associate(AbstractWrapper):
        (Williams 2012).
     5. Each component is resampled, by `resample`.
 
-    The mass grows by log p of the scan over that of clutter alone, as `ClutteredModel` has it. Three
-    things are approximate: belief propagation, whose log p is Bethe's, and exact where no two
+    The mass grows by log p of the scan over that of clutter alone, as that of `ClutteredModel`.
+    Three things are approximate: belief propagation, whose log p is Bethe's, and exact where no two
     objects compete for two measurements; step 4; and the product form after each scan. Labels count
     objects up from 1. They are not identities once two objects have been close, whoever computes
     them. `memory["targets"]` holds the number, the labels, and how many objects were crowded out.
