@@ -12,6 +12,7 @@ from mpfjax.vision.tracking.associate import (
     mahalanobis,
     marginals,
     one_to_one,
+    probabilities,
     unlikeness,
 )
 from mpfjax.vision.tracking.gaussian import Gaussian, overlap
@@ -45,6 +46,13 @@ def test_the_marginals_are_those_of_all_assignments(loops, bound):
         gaps.append(np.abs(marginals(log_odds) - expected))
     assert np.max(gaps) < bound
     assert np.mean(gaps) < bound / 5
+
+
+def test_lone_pairs_and_those_with_rivals_have_the_marginals_of_all():
+    rng = np.random.default_rng(3)
+    cost = rng.normal(-2, 5, (9, 8))
+    cost[rng.uniform(0, 1, (9, 8)) > 0.2] = np.inf
+    np.testing.assert_allclose(probabilities(cost), marginals(-cost / 4), atol=1e-6)
 
 
 def test_marginals_of_large_odds_are_those_of_all_assignments():
@@ -85,20 +93,35 @@ def test_a_pairs_cost_is_students_density_in_boxes():
     variances, errors = rng.uniform(0.01, 0.02, (2, 4)), np.full(4, 0.05)
     moments = Gaussian(place, place * 0, variances, place, place)
     seen = place[:, None] + rng.normal(0, 0.5, (2, 3, 4))
-    cost = mahalanobis(moments, errors, seen[0])
+    beside = rng.uniform(-3, 1, (2, 3))
+    cost = mahalanobis(moments, errors, seen[0], beside)
     for m in range(2):
         unit = np.array([*np.exp(place[m, 2:]), 1, 1])
         total = variances[m] / unit**2 + errors**2
         t = multivariate_t(np.zeros(4), np.diag(total), df=4)
         logs = np.array([t.logpdf((point - place[m]) / unit) for point in seen[0]])
         expected = -2 * (logs - t.logpdf(np.zeros(4))) + np.log(total).sum()
-        np.testing.assert_allclose(cost[m], expected, rtol=1e-9)
+        np.testing.assert_allclose(cost[m], expected + beside[m], rtol=1e-9)
+
+
+def test_pairs_that_are_left_out_by_x_alone_cost_more_than_none():
+    rng = np.random.default_rng(0)
+    place = np.c_[rng.uniform(0, 300, (40, 2)), rng.normal(3, 0.1, (40, 2))]
+    moments = Gaussian(place, place, rng.uniform(0.01, 9, (40, 4)), place, place)
+    beside = rng.uniform(-3, 1, (40, 40))
+    cost = mahalanobis(moments, np.full(4, 0.05), place + 0.2, beside)
+    # Where pairs cost so much less beside distance, none is left out.
+    unlimited = mahalanobis(moments, np.full(4, 0.05), place + 0.2, beside - 4e3) + 4e3
+    near = np.isfinite(cost)
+    assert 40 < near.sum() < 1500 and near.sum() < (unlimited < np.inf).sum()
+    np.testing.assert_allclose(cost[near], unlimited[near], atol=1e-6)
+    assert (unlimited[~near] >= 0).all()
 
 
 def test_a_very_wide_prediction_still_forms_a_pair_with_what_lies_at_it():
     place = np.zeros((1, 4))
     wide = Gaussian(place, place, place + 1e4, place, place)
-    assert float(mahalanobis(wide, np.zeros(4) + 0.1, place)[0, 0]) < 0
+    assert float(mahalanobis(wide, np.zeros(4) + 0.1, place, np.zeros((1, 1)))[0, 0]) < 0
 
 
 def test_colours_cost_by_their_distance_and_nothing_where_they_are_not_known():

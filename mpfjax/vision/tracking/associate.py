@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
+from scipy.special import expit
 
 from mpfjax.vision.tracking.gaussian import Gaussian
 
@@ -52,23 +53,31 @@ def mahalanobis(
     predicted: Gaussian,
     errors: Float[np.ndarray, "4"],
     places: Float[np.ndarray, "d 4"],
+    beside: Float[np.ndarray, "m d"],
     slack: Float[np.ndarray, "2"] | None = None,
 ) -> Float[np.ndarray, "m d"]:
     """-2 log p of each detection under each prediction, up to a constant, with lengths in boxes.
 
     Student's density with ν = 4 degrees of freedom: (ν + 4) log(1 + |d - μ|² / ν) + log |S|. What
-    has been unseen for long has a large |S|, and less of a claim. `slack`: deviations of x and y,
-    in pixels, to be added to those of all predictions.
+    has been unseen for long has a large |S|, and less of a claim. `beside`: what pairs cost beside
+    distance, added to it. `slack`: deviations of x and y, in pixels, to be added to those of all
+    predictions. Pairs that x alone puts above a cost of 0 cost infinitely.
     """
-    unit = predicted.unit
+    unit, place = predicted.unit, predicted.place
     total = predicted.var_place + (unit * errors) ** 2
     if slack is not None:
         total = total + np.append(slack, [0, 0]) ** 2
-    volumes = np.sum(np.log(total / unit**2), axis=1)
-    gaps = (places[None, :, k] - predicted.place[:, None, k] for k in range(total.shape[1]))
-    squares = sum(gap**2 / total[:, None, k] for k, gap in enumerate(gaps))
-    tails = (_FREEDOM + total.shape[1]) * np.log1p(squares / _FREEDOM)
-    return tails + np.minimum(volumes, _WIDEST)[:, None]
+    power = _FREEDOM + total.shape[1]
+    volumes = np.minimum(np.sum(np.log(total / unit**2), axis=1), _WIDEST)
+    most = _FREEDOM * np.expm1((-volumes - np.min(beside, initial=0.0)) / power)
+    # Most objects and detections are far apart: only near ones are worth all coordinates.
+    near = (places[:, 0] - place[:, :1]) ** 2 < (most * total[:, 0])[:, None]
+    rows, columns = np.nonzero(near)
+    gaps = places[columns] - place[rows]
+    tails = power * np.log1p(np.sum(gaps**2 / total[rows], axis=1) / _FREEDOM)
+    cost = np.full(near.shape, np.inf)
+    cost[rows, columns] = tails + volumes[rows] + beside[rows, columns]
+    return cost
 
 
 def marginals(log_odds: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
@@ -98,7 +107,13 @@ def marginals(log_odds: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
 
 def probabilities(cost: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
     """The marginals of pairs by their costs, -2 log p; a row without a pair costs nothing."""
-    return marginals(-cost / (2 * _TEMPERATURE))
+    log_odds, possible = -cost / (2 * _TEMPERATURE), np.isfinite(cost)
+    # Most pairs have no rival, and those who have are few.
+    rivals = possible & ((possible.sum(axis=1) > 1)[:, None] | (possible.sum(axis=0) > 1))
+    block = np.ix_(rivals.any(axis=1), rivals.any(axis=0))
+    probability = expit(log_odds)
+    probability[block] = marginals(log_odds[block])
+    return probability
 
 
 def argmax_pairs(value: Float[np.ndarray, "m d"]) -> Int[np.ndarray, " m"]:

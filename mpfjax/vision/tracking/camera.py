@@ -95,7 +95,7 @@ def jolted(
     objects, unlike = predicted.at(rows), unlike[rows]
 
     def explained(shift: np.ndarray) -> int:
-        cost = mahalanobis(objects.shifted(shift), errors, places) + unlike
+        cost = mahalanobis(objects.shifted(shift), errors, places, unlike)
         return int((cost < 0).any(axis=1).sum())
 
     still = explained(np.zeros(2))

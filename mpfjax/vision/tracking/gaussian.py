@@ -98,6 +98,8 @@ class Gaussian(NamedTuple):
 
     def at(self, rows: np.ndarray) -> "Gaussian":
         """The moments of some rows."""
+        if rows.dtype == bool and rows.all():
+            return self  # nobody writes into moments but those who made them
         return Gaussian(*(moment[rows] for moment in self))
 
     def put(self, rows: np.ndarray, other: "Gaussian") -> None:
@@ -107,6 +109,8 @@ class Gaussian(NamedTuple):
 
     def joined(self, other: "Gaussian") -> "Gaussian":
         """The rows of both, one after the other."""
+        if not len(other.place):
+            return self
         return Gaussian(*map(np.concatenate, zip(self, other, strict=True)))
 
 
@@ -166,8 +170,9 @@ def places_of(boxes: Float[np.ndarray, "*m 4"]) -> Float[np.ndarray, "*m 4"]:
 
 def units(places: Float[np.ndarray, "*m 4"]) -> Float[np.ndarray, "*m 4"]:
     """The units of length along each coordinate: (w, h, 1, 1)."""
-    sizes = np.exp(places[..., 2:])
-    return np.concatenate([sizes, np.ones_like(sizes)], axis=-1)
+    lengths = np.ones_like(places)
+    np.exp(places[..., 2:], out=lengths[..., :2])
+    return lengths
 
 
 def overlap(a: Float[np.ndarray, "m 4"], b: Float[np.ndarray, "d 4"]) -> Float[np.ndarray, "m d"]:

@@ -74,7 +74,7 @@ class NoiseState(NamedTuple):
 
     def after(
         self,
-        rows: np.ndarray,
+        rows: Bool[np.ndarray, " m"],
         places: Float[np.ndarray, "k 4"],
         teaches: Bool[np.ndarray, " k"],
         grown: Gaussian,

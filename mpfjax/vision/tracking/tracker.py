@@ -211,7 +211,7 @@ def advanced(
     strong = found.scores >= scores.strong
 
     predicted, noises = state.objects, state.noise.noises
-    cost = mahalanobis(predicted, noises.errors, places) + unlike
+    cost = mahalanobis(predicted, noises.errors, places, unlike)
     source, probability = _associated(state, cost, strong, found.scores >= scores.weak)
     taken, rows = _Taken.of(source, strong), np.flatnonzero(source >= 0)
     before, place = predicted.at(rows), places[source[rows]]
@@ -235,7 +235,7 @@ def advanced(
     known = teaches & counted.confirmed & (counted.seen >= _FIRST)
     grown = objects.at(teaches & (counted.seen == _FIRST))
     speed = noises.speed
-    noise = state.noise.after(rows, place, known[rows], grown)
+    noise = state.noise.after(taken.there, place, known[rows], grown)
     moments = noise.moments.at(stays).joined(noise.begun(places[born], speed))
     unit = units(places[born])
     start = Gaussian.begun(places[born], unit * noises.errors, unit * speed)
@@ -337,7 +337,7 @@ def _with_camera(
     box = np.exp(objects.place[confirmed, 2:].sum(axis=0) / max(confirmed.sum(), 1))
     slack = 2 * (camera.left if known else camera.deviations) * box
     sure, detected = objects.at(confirmed), places[strong]
-    cost = mahalanobis(sure, errors, detected, slack) + unlike[np.ix_(confirmed, strong)]
+    cost = mahalanobis(sure, errors, detected, unlike[np.ix_(confirmed, strong)], slack)
     camera, shift = camera.after(sure, gone[confirmed] + jolt, known, cost, errors, detected, box)
     shift = jolt + shift
     noise = state.noise._replace(moments=state.noise.moments.shifted(shift))
