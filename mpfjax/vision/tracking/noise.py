@@ -74,7 +74,7 @@ class NoiseState(NamedTuple):
 
     def after(
         self,
-        rows: Bool[np.ndarray, " m"],
+        rows: np.ndarray,
         places: Float[np.ndarray, "k 4"],
         teaches: Bool[np.ndarray, " k"],
         grown: Gaussian,
