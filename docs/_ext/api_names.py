@@ -1,7 +1,6 @@
 """The public names of mpfjax: what the API pages show, and what code in pages links to."""
 
 import importlib
-import importlib.util
 from functools import cache
 from typing import Any
 
@@ -12,8 +11,10 @@ MODULES = (
     "exact",
     "plotting",
     "smoothing",
+    "robots",
     "mpfjax",
 )  # the top last
+PLACES = {"mpfjax": "mpfjax", "robots": "mpfjax.models.robots"}  # of those that stand elsewhere
 
 
 @cache
@@ -26,17 +27,15 @@ def public_names() -> dict[str, str]:
     shown: dict[int, str] = {}
     for name in MODULES:
         full = name if name == "mpfjax" else f"mpfjax.{name}"
-        if importlib.util.find_spec(full) is None:
-            continue
-        module = importlib.import_module(full)
-        for each in _public_in(module, full):
+        module = importlib.import_module(PLACES.get(name, full))
+        for each in _public_in(module):
             target = shown.setdefault(id(getattr(module, each)), f"{full}.{each}")
             found[f"{full}.{each}"] = found[f"{name}.{each}"] = target
             found.setdefault(each, target)
     return found
 
 
-def _public_in(module: Any, full: str) -> list[str]:
+def _public_in(module: Any) -> list[str]:
     """The classes and functions that a module offers: what it defines, or hands on."""
     is_package = hasattr(module, "__path__")
     return [
@@ -45,5 +44,5 @@ def _public_in(module: Any, full: str) -> list[str]:
         if not name.startswith("_")
         and callable(value)
         and getattr(value, "__module__", "").startswith("mpfjax.")
-        and (is_package or value.__module__ == full)
+        and (is_package or value.__module__ == module.__name__)
     ]

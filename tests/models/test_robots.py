@@ -1,0 +1,257 @@
+"""A robot's parts beside loops written from the tables of Thrun, Burgard and Fox (2005)."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from scipy.stats import norm
+
+import mpfjax
+from mpfjax import robots
+
+CELL = 0.1
+WALLS = np.zeros((30, 40), bool)
+WALLS[[0, -1]] = WALLS[:, [0, -1]] = True
+WALLS[8:12, 20:25] = WALLS[20:, 12] = True
+FREE = ~WALLS
+FREE[25:29, 1:12] = False  # unknown
+GRID = robots.OccupancyGrid(WALLS, FREE, resolution=CELL, origin=(-1.0, 2.0))
+ANGLES = jnp.linspace(-2.0, 2.0, 9)
+SCAN = jnp.array([1.1, np.nan, 0.4, np.inf, 0.02, 1.7, 3.0, 0.9, 2.2])
+MOUNT, MOST, LEAST = (0.2, -0.1, 0.3), 2.5, 0.05
+PLACES = [(0.3, 3.1, 0.4), (2.05, 4.4, -2.9), (-0.5, 2.6, 1.5)]
+POSES = jnp.array(PLACES)
+SHARED = {"laser_max_range": MOST, "laser_min_range": LEAST, "mount": MOUNT, "exponent": 0.5}
+WEIGHTS = {"z_hit": 0.7, "z_rand": 0.2, "sigma_hit": 0.15}
+
+
+def scanner(pose):
+    x, y, heading = pose
+    forward, left, turn = MOUNT
+    x += np.cos(heading) * forward - np.sin(heading) * left
+    y += np.sin(heading) * forward + np.cos(heading) * left
+    return x, y, heading + turn
+
+
+def cell(x, y):
+    column, row = int(np.floor((x + 1.0) / CELL)), int(np.floor((y - 2.0) / CELL))
+    return (row, column) if 0 <= row < 30 and 0 <= column < 40 else None
+
+
+def gap(x, y):
+    """Metres to the nearest occupied cell, at most those of the field."""
+    here, most = cell(x, y), 0.8
+    if here is None:
+        return most
+    return min(most, CELL * np.min(np.hypot(*(np.argwhere(WALLS) - here).T)))
+
+
+def cast(x, y, heading):
+    for reach in np.arange(0, MOST, 0.002):
+        here = cell(x + reach * np.cos(heading), y + reach * np.sin(heading))
+        if here is not None and WALLS[here]:
+            return reach
+    return MOST
+
+
+def beams():
+    for z, angle in zip(SCAN.tolist(), ANGLES.tolist(), strict=True):
+        if not np.isnan(z):
+            yield (MOST if z <= LEAST else min(z, MOST)), angle
+
+
+def test_likelihood_field_is_table_6_3():
+    sensor = robots.LikelihoodField(ANGLES, laser_likelihood_max_dist=0.8, **SHARED, **WEIGHTS)
+    for pose, found in zip(PLACES, sensor.log_likelihood(SCAN, POSES, GRID), strict=True):
+        (x, y, heading), q = scanner(pose), 1.0
+        for z, angle in beams():
+            if z < MOST:
+                ends = x + z * np.cos(heading + angle), y + z * np.sin(heading + angle)
+                q *= (0.7 * norm.pdf(gap(*ends), 0, 0.15) + 0.2 / MOST) / 0.9
+        assert found == pytest.approx(0.5 * np.log(q), rel=1e-4)
+
+
+def test_beam_model_is_table_6_1():
+    more = {"z_short": 0.05, "z_max": 0.1, "lambda_short": 0.6}
+    sensor = robots.BeamModel(ANGLES, **SHARED, **WEIGHTS, **more)
+    for pose, found in zip(PLACES, sensor.log_likelihood(SCAN, POSES, GRID), strict=True):
+        (x, y, heading), q = scanner(pose), 1.0
+        for z, angle in beams():
+            expected = float(
+                GRID.ranges(jnp.array([[x, y, heading]]), jnp.array([angle]), MOST)[0, 0]
+            )
+            inside = norm.cdf(MOST, expected, 0.15) - norm.cdf(0, expected, 0.15)
+            p = 0.7 * norm.pdf(z, expected, 0.15) / inside
+            if z <= expected:
+                p += 0.05 * 0.6 * np.exp(-0.6 * z) / (1 - np.exp(-0.6 * expected))
+            p += 0.1 if z == MOST else 0.2 / MOST
+            q *= p / 1.05
+        assert found == pytest.approx(0.5 * np.log(q), rel=1e-4)
+
+
+def test_ranges_are_those_of_small_steps():
+    found = np.asarray(GRID.ranges(POSES, ANGLES, MOST))
+    expected = [
+        [cast(x, y, heading + angle) for angle in ANGLES.tolist()] for x, y, heading in PLACES
+    ]
+    assert np.all(found - expected < CELL / 2 + 0.002)
+    assert np.all(found - expected > -1e-3)
+    centred = jnp.array([[0.35, 3.15, 0.0], [2.05, 4.45, np.pi / 2]])
+    angles = jnp.array([0.0, np.pi / 2, -np.pi])
+    table = GRID.tabulated(num_angles=4)
+    assert table.ranges(centred, angles, MOST) == pytest.approx(GRID.ranges(centred, angles, MOST))
+
+
+def test_only_used_beams_count():
+    """Of nine beams three, evenly spaced; the others may say anything."""
+    sensor = robots.LikelihoodField(ANGLES, laser_max_range=MOST, max_beams=3)
+    three = robots.LikelihoodField(ANGLES[::4], laser_max_range=MOST)
+    expected = three.log_likelihood(SCAN[::4], POSES, GRID)
+    assert sensor.log_likelihood(SCAN, POSES, GRID) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("step", [(0.4, 0.1, 0.5), (-0.3, 0.1, 0.2), (0.001, 0.002, 0.9)])
+def test_odometry_is_table_5_6(step):
+    noise = np.array([[0.3, -1.2, 0.7], [-0.8, 0.1, 1.9], [0.0, 0.4, -1.1]])
+    motion = robots.OdometryMotion(0.1, 0.2, 0.3, 0.15)
+    found = motion.from_noise(jnp.asarray(noise, jnp.float32), POSES, jnp.asarray(step))
+    forward, left, turn = step
+    rot1, trans = np.arctan2(left, forward), np.hypot(forward, left)
+    if forward < 0:
+        rot1, trans = rot1 - np.pi, -trans
+    rot2 = turn - rot1
+    of1, of2 = (0.0, turn) if abs(trans) < 0.01 else (rot1, rot2)
+    deviations = np.sqrt([
+        0.1 * of1**2 + 0.2 * trans**2,
+        0.3 * trans**2 + 0.15 * (of1**2 + of2**2),
+        0.1 * of2**2 + 0.2 * trans**2,
+    ])  # fmt: skip
+    for (x, y, heading), e, after in zip(PLACES, noise, found, strict=True):
+        one, far, other = np.array([rot1, trans, rot2]) + deviations * e
+        moved = x + far * np.cos(heading + one), y + far * np.sin(heading + one)
+        assert after[:2] == pytest.approx(moved, abs=1e-4)
+        turned = after[2] - (heading + one + other)
+        assert np.sin(turned / 2) == pytest.approx(0, abs=1e-4)
+        assert abs(after[2]) <= np.pi
+
+
+def test_density_of_a_step_is_one():
+    """Its integral over a box, by uniform draws."""
+    motion, step = robots.OdometryMotion(0.1, 0.1, 0.1, 0.1), jnp.array([0.5, 0.2, 0.4])
+    low, high = np.array([-0.8, -1.2, -np.pi]), np.array([1.6, 1.4, np.pi])
+    draws = np.random.default_rng(0).uniform(low, high, (200_000, 3))
+    before = jnp.zeros((len(draws), 3))
+    values = np.exp(motion.log_density(jnp.asarray(draws, jnp.float32), before, step))
+    integral, error = values.mean(), values.std() / np.sqrt(len(draws))
+    assert integral * np.prod(high - low) == pytest.approx(1, abs=4 * error * np.prod(high - low))
+
+
+def robot(**options):
+    sensor = robots.LikelihoodField(ANGLES, laser_max_range=MOST)
+    return robots.RobotModel(GRID, robots.OdometryMotion(), sensor, **options)
+
+
+def test_model_agrees_with_itself():
+    mpfjax.check_model(jax.random.key(0), robot(), SCAN, inputs=jnp.array([0.3, 0.0, 0.2]))
+    with pytest.raises(ValueError, match="inputs: None"):
+        robot().sample_transition(jax.random.key(0), POSES)
+
+
+def test_first_pose_is_uniform_on_free_cells():
+    model = robot(clearance=0.15)
+    columns, rows = np.meshgrid(np.arange(-1.05, 3.2, CELL), np.arange(1.95, 5.2, CELL))
+    poses = np.stack([columns.ravel(), rows.ravel(), 0 * rows.ravel()], axis=1)
+    density = np.exp(model.log_initial(jnp.asarray(poses, jnp.float32)))
+    assert density.sum() * CELL**2 * 2 * np.pi == pytest.approx(1, rel=1e-4)
+    draws = model.sample_initial(jax.random.key(0), 20_000)
+    assert np.isfinite(model.log_initial(draws)).all()
+    is_start = FREE & (np.asarray(GRID.distances) > 0.15)
+    expected = GRID.resolution * (np.argwhere(is_start)[:, ::-1] + 0.5).mean(axis=0) + [-1.0, 2.0]
+    assert draws.mean(axis=0) == pytest.approx([*expected, 0], abs=4 * 1.9 / np.sqrt(20_000))
+
+
+def test_first_pose_near_a_given_one():
+    model = robot(initial_pose=(0.3, 3.1, 3.0), initial_deviations=(0.2, 0.3, 0.4))
+    draws = np.asarray(model.sample_initial(jax.random.key(0), 2000))
+    turns = (draws[:, 2] - 3.0 + np.pi) % (2 * np.pi) - np.pi
+    away = np.stack([*(draws[:, :2] - [0.3, 3.1]).T, turns], axis=1)
+    assert model.log_initial(jnp.asarray(draws)) == pytest.approx(
+        norm.logpdf(away, 0, [0.2, 0.3, 0.4]).sum(axis=1), abs=1e-3
+    )
+    assert away.std(axis=0) == pytest.approx([0.2, 0.3, 0.4], rel=4 / np.sqrt(2 * 2000))
+
+
+@pytest.mark.parametrize("negate", [0, 1])
+def test_map_of_ros(tmp_path, negate):
+    """Written and read again: rows from the top, unknown cells, thresholds, origin."""
+    grey = np.where(WALLS, 0, np.where(FREE, 254, 205)).astype(np.uint8)[::-1]
+    unknown = 205 if not negate else 50
+    grey = np.where(grey == 205, unknown, 255 - grey if negate else grey).astype(np.uint8)
+    Image.fromarray(grey).save(tmp_path / "map.pgm")
+    said = {"image": "map.pgm", "resolution": CELL, "origin": [-1.0, 2.0, 0.0], "negate": negate,
+            "occupied_thresh": 0.65, "free_thresh": 0.196, "mode": "trinary"}  # fmt: skip
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(said))
+    found = robots.read_map(tmp_path / "map.yaml")
+    assert (found.occupied == WALLS).all()
+    assert (found.free == FREE).all()
+    assert (found.resolution, found.origin) == (CELL, (-1.0, 2.0))
+    for name, value in (("mode", "raw"), ("origin", [0, 0, 0.1])):
+        (tmp_path / "bad.yaml").write_text(yaml.safe_dump(said | {name: value}))
+        with pytest.raises(ValueError, match=name):
+            robots.read_map(tmp_path / "bad.yaml")
+
+
+def test_map_of_an_image(tmp_path, monkeypatch):
+    """A transparent pixel is unknown."""
+    pixels = np.array([[[0, 255], [255, 255]], [[255, 0], [128, 255]]], np.uint8)
+    Image.fromarray(pixels, "LA").save(tmp_path / "plan.png")
+    found = robots.read_map(tmp_path / "plan.png", resolution=0.5)
+    assert found.occupied.tolist() == [[False, False], [True, False]]
+    assert found.free.tolist() == [[False, False], [False, True]]
+    with pytest.raises(ValueError, match="resolution"):
+        robots.read_map(tmp_path / "plan.png")
+    monkeypatch.setitem(sys.modules, "PIL.Image", None)
+    with pytest.raises(ImportError, match="pip install pillow"):
+        robots.read_map(tmp_path / "plan.png", resolution=0.5)
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="occupied"):
+        robots.OccupancyGrid(np.zeros((2, 2), bool), resolution=CELL)
+    with pytest.raises(ValueError, match="free"):
+        robots.OccupancyGrid(np.ones((2, 2), bool), np.ones((2, 2), bool), resolution=CELL)
+    with pytest.raises(ValueError, match="clearance"):
+        robot(clearance=9.0)
+    with pytest.raises(ValueError, match="observation"):
+        robot().log_likelihood(SCAN[1:], POSES)
+
+
+def test_a_lost_robot_is_found():
+    poses = np.array([-0.5, 2.8, 0.0]) + np.linspace(0, 1, 13)[:, None] * [2.9, 0.3, 0.9]
+    rng = np.random.default_rng(0)
+    sensor = robots.LikelihoodField(2 * np.pi * np.arange(24) / 24, laser_max_range=MOST)
+    model = robots.RobotModel(GRID, robots.OdometryMotion(0.05, 0.05, 0.05, 0.05), sensor)
+    scans = np.array(
+        GRID.ranges(jnp.asarray(poses[1:], jnp.float32), sensor.angles, MOST)
+    ) + 0.03 * rng.normal(size=(12, 24))
+    scans[3, 5:9], scans[6] = np.inf, np.nan
+    filter = mpfjax.mixture_particle_filter(model, 3000, 8, scale=(0.5, 0.5, 0.5, 0.5))
+    run = mpfjax.run_filter(jax.random.key(1), filter, scans, inputs=robots.odometry_steps(poses))
+    away = np.asarray(run.final.mean()) - poses[-1]
+    assert np.hypot(*away[:2]) < 0.15
+    assert abs(away[2]) < 0.15
+
+
+@pytest.mark.real_data
+def test_public_map(data):
+    """TurtleBot3's world, most of which is unknown."""
+    path = data / "maps" / "turtlebot3_world.pgm"
+    if not path.is_file():
+        pytest.skip(f"no {path}")
+    grid = robots.read_map(path, resolution=0.05)
+    assert grid.occupied.shape == (384, 384)
+    assert 0 < grid.occupied.sum() < grid.free.sum() < (~grid.free & ~grid.occupied).sum()
