@@ -104,8 +104,10 @@ def test_walks_end_at_files_that_are_there():
 def test_every_public_name_is_on_an_api_page(monkeypatch):
     monkeypatch.syspath_prepend(DOCS / "_ext")
     names = importlib.import_module("api_names").public_names()
-    text = "".join(TEXTS[page] for page in TEXTS if DOCS / "api" in page.parents)
-    shown = re.findall(r"^\.\. auto(?:class|function|data):: (\S+)", text, re.MULTILINE)
+    entry = re.compile(r"^\.\. auto(?:class|function|data):: (\S+)", re.MULTILINE)
+    pages = {page: entry.findall(TEXTS[page]) for page in TEXTS if DOCS / "api" in page.parents}
+    assert max(map(len, pages.values())) <= 12, "a page is too long to read"
+    shown = [name for page in pages.values() for name in page]
     assert len(shown) == len(set(shown)), "a name stands on two pages"
     # Pages also show what functions return, under the names of their files.
     assert set(names.values()) <= {names.get(name, name) for name in shown}
