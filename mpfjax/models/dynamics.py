@@ -181,7 +181,7 @@ class WalkWithVelocity(AbstractDynamics):
     has of a velocity that is itself a random walk, so that a particle carries its velocity without
     drawing it. With a gain of 0, v never changes; with 1, it is the last displacement.
 
-    The past that a model keeps is x_t - v_t, the place from which x_t would come at its velocity
+    A model that keeps the past keeps x_t - v_t: where x_{t-1} was, had it moved at this velocity
     (`remembered`).
 
     - `walk`: the noise of x_t, a `RandomWalk` or `RandomWalkWithJumps`.

@@ -55,7 +55,8 @@ def check_model(
     - a draw, or a density at a draw of the model, that is NaN; a likelihood that is zero for all
       particles; a density of a particle that depends on the other particles;
     - a `log_transition` that is not the density of `sample_transition`, but for a constant factor.
-      Given x_1 and some possible x_0, the one that it came from must be as likely as it says.
+      A draw of x_1 comes from one of some possible x_0. By the density each of these has a
+      probability to be its origin, and the true origin must be as probable as that, in the mean.
 
     The last two look at a few thousand random draws, of x_0 and of the first two steps: they accept
     a right model, and may accept one that is wrong by a few percent, or in what seldom happens.

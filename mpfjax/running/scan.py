@@ -35,9 +35,9 @@ class FilterRun(eqx.Module):
     - `effective_sample_size`: 1 / Σ W², of the joint weights W of all particles after each step.
     - `log_evidence_against_start`: that of each step's `StepInfo`, and None unless a move of the
       filter tells it.
-    - `surprised`: the steps at which all hypotheses seem wrong: the cumulative sum of that
-      evidence, which never falls below zero nor rises above 10, is above 5 (a CUSUM, Page 1954);
-      None likewise.
+    - `surprised`: the steps at which all hypotheses seem wrong, since the cumulative sum of that
+      evidence is above 5. It never falls below zero nor rises above 10 (a CUSUM, Page 1954). None
+      likewise.
     """
 
     log_marginal_likelihood: Float[Array, ""]

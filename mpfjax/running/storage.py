@@ -32,7 +32,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
 
     - `state`: arrays, typed keys and numbers in any pytree, such as `{"mixture": mixture, "t": t}`
       or a `Filter`. Of other things, such as a network's activation, only the name is written.
-    - `path`: a .npz file without pickles. After an interruption it is the old file or the new one.
+    - `path`: a .npz file without pickles. If writing is interrupted, the old file stays.
 
     Raises `OSError` if the file cannot be written, for example on a full disk; the old file is then
     still there. Call it every thousand steps, for example, of a filter that runs for a long time:

@@ -67,7 +67,7 @@ class NetworkProposal(_GaussianProposal):
     q = N(x_{t-1} + s a, diag(s exp b)²), (a, b) = network(x_{t-1}, y_t), for each particle. The
     network learns from the bound E[log Ẑ] <= log Z: the better q fits, the higher is E[log Ẑ].
     `tuning.fit` maximises it in the network's arrays (Maddison et al. 2017, FIVO). Take
-    `gradient="none"`, which differentiates the draws and not the resampling, as they do. The
+    `gradient="none"`: as in that paper, it differentiates the draws and not the resampling. The
     filter is exact whatever the network is.
 
     - `network`: a function of one vector, the flattened state followed by the flattened

@@ -44,12 +44,11 @@ class Resample(AbstractResampling):
     - `particles_per_component`: None shares all slots among the living components that are
       resampled, as `allocation` says. A number k gives each living component k particles and
       leaves the other slots empty, as section 5.2 of the paper does.
-    - `allocation`: how the components share the slots, where neither `particles_per_component` nor
-      `group` says it. "variance" deals component m a number in proportion to the root of
-      k_m Σ_{c_i = m} exp 2ℓ_i, or of π_m^2 k_m / ESS_m, which leaves Ẑ the least variance
-      (Neyman 1934), and shares a quarter to a half equally, so that every mode stays alive (see
-      docs/masses.md). "equal" is the paper's: it keeps modes of little mass longest, and log Ẑ is
-      less exact.
+    - `allocation`: how the components share the slots, if neither `particles_per_component` nor
+      `group` says it. "variance" leaves Ẑ the least variance (Neyman 1934): component m has
+      a share in proportion to the root of π_m² k_m / ESS_m. A quarter to a half of the slots is
+      shared equally, so that every mode stays alive (see docs/masses.md). "equal" is the paper's:
+      it keeps modes of little mass longest, and log Ẑ is less exact.
     - `group`: a function that gives each particle the whole number of its group, the same within
       a component. Groups with a component that is resampled share the slots equally, and so do the
       components within a group. None makes no groups. Use it where components are rival hypotheses

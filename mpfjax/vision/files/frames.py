@@ -100,7 +100,7 @@ def write_video(
 ) -> None:
     """Write RGB frames to an MP4 or, by the ending of `path`, a GIF that loops.
 
-    In the place of None, a frame that could not be decoded, is the one before it. Raises
+    None, a frame that could not be decoded, is written as the frame before it. Raises
     `ValueError` for another ending, frames that are no images of one size and a rate that is not
     positive, `ImportError` where PyAV is missing for an MP4.
     """
