@@ -1,7 +1,7 @@
 """The index of the API: the pages of entries, and each entry with what it is in one line."""
 
-import importlib
 import inspect
+import pkgutil
 import re
 from pathlib import Path
 
@@ -42,6 +42,5 @@ class ApiPages(SphinxDirective):
 
 def summary_of(name: str) -> str:
     """The first paragraph of a docstring."""
-    module, _, attribute = name.rpartition(".")
-    text = inspect.getdoc(getattr(importlib.import_module(module), attribute)) or ""
+    text = inspect.getdoc(pkgutil.resolve_name(name)) or ""
     return " ".join(" ".join(docstrings.to_rst(text.partition("\n\n")[0].split("\n"))).split())

@@ -1,7 +1,7 @@
 """The extension of Sphinx for this site: docstrings, links from code to the API, MathML."""
 
-import importlib
 import inspect
+import pkgutil
 import re
 import types
 import typing
@@ -34,8 +34,7 @@ def target_of(code: str) -> str | None:
     owner, _, member = name.rpartition(".")
     if owner in names and member and not member.startswith("_"):
         holder = names[owner]
-        module, _, attribute = holder.rpartition(".")
-        kind = getattr(importlib.import_module(module), attribute)
+        kind = pkgutil.resolve_name(holder)
         if member in getattr(kind, "__dataclass_fields__", ()):
             return holder  # in whose text fields are
         if member in vars(kind):
@@ -77,15 +76,10 @@ def _ancestors(node: nodes.Node) -> list[nodes.Node]:
 
 def _exists(code: str) -> bool:
     """Whether a dotted name is a module, or can be reached from one."""
-    name = re.sub(r"\(.*", "", code, flags=re.DOTALL)
     try:
-        importlib.import_module(name)
-    except ImportError:
-        owner, _, last = name.rpartition(".")
-        try:
-            return hasattr(importlib.import_module(owner), last)
-        except ImportError:
-            return False
+        pkgutil.resolve_name(re.sub(r"\(.*", "", code, flags=re.DOTALL))
+    except (ImportError, AttributeError):
+        return False
     return True
 
 
