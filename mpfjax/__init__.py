@@ -83,6 +83,7 @@ from mpfjax.operations.random import normal as normal
 from mpfjax.report import StepInfo as StepInfo
 from mpfjax.running.islands import IslandInteraction as IslandInteraction
 from mpfjax.running.islands import run_islands as run_islands
+from mpfjax.running.late import Replay as Replay
 from mpfjax.running.long_runs import Checkpoint as Checkpoint
 from mpfjax.running.run import monte_carlo as monte_carlo
 from mpfjax.running.run import run_filter as run_filter

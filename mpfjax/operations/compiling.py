@@ -59,7 +59,7 @@ def jit_with(
 
 
 def jit_on_wide_vectors(
-    function: Callable[..., PyTree], one_thread: bool = False
+    function: Callable[..., PyTree], one_thread: bool = False, soon: bool = False
 ) -> Callable[..., PyTree]:
     """`equinox.filter_jit` with `cpu_options`, with which random draws take half the time.
 
@@ -72,7 +72,7 @@ def jit_on_wide_vectors(
     @functools.cache
     def wide() -> Callable[..., PyTree]:
         # Asking JAX for the platform before the first call would keep processes from joining.
-        return jit_with(cpu_options(one_thread=one_thread), function)
+        return jit_with(cpu_options(soon, one_thread), function)
 
     @functools.wraps(function)
     def run(*arguments: Any, **named: Any) -> PyTree:

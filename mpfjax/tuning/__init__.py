@@ -6,6 +6,7 @@ from mpfjax.tuning.bijections import Simplex as Simplex
 from mpfjax.tuning.curvature import standard_errors as standard_errors
 from mpfjax.tuning.densities import log_density as log_density
 from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
+from mpfjax.tuning.happened import posterior_trajectories as posterior_trajectories
 from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
 from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
 from mpfjax.tuning.optimisation import fit as fit

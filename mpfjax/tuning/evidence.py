@@ -35,11 +35,12 @@ class LogEvidence(eqx.Module):
         runs = self.runs(key, filter)
         return jnp.asarray(sum(jnp.sum(run.log_marginal_likelihood) for run in runs))
 
-    def runs(self, key: Key[Array, ""], filter: Filter) -> list[FilterRun]:
-        """The runs of each group, with nothing collected."""
+    def runs(self, key: Key[Array, ""], filter: Filter, whole: bool = False) -> list[FilterRun]:
+        """The runs of each group, with all mixtures collected, or nothing."""
+        collect = None if whole else lambda mixture: None
 
         def run(key: Key[Array, ""], series: Series) -> FilterRun:
-            return scan(key, filter, series, lambda mixture: None)
+            return scan(key, filter, series, collect)
 
         return [
             jax.vmap(run)(jax.random.split(jax.random.fold_in(key, g), group.length), group)

@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,19 +10,14 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count, checked, optional, shown
-from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.models.observations import steps_of_inputs
 from mpfjax.models.trial import steps_ahead
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.smoothing.backward import draw
 from mpfjax.tuning.gibbs import GibbsPosterior
+from mpfjax.tuning.happened import Chains, PosteriorTrajectories, drawn_states
 from mpfjax.tuning.metropolis import Posterior
 from mpfjax.tuning.sequential import SequentialPosterior
-
-Chains = Posterior | GibbsPosterior | SequentialPosterior
-
-_TOGETHER = 64  # of the draws that share a program's step
 
 
 class Predictive(NamedTuple):
@@ -36,7 +31,12 @@ class Predictive(NamedTuple):
 
 @checked
 def posterior_predictive(
-    key: Key[Array, ""], posterior: Chains, num_steps: Count, *, inputs: PyTree = None
+    key: Key[Array, ""],
+    posterior: Chains,
+    num_steps: Count,
+    *,
+    num_trajectories: Count | None = None,
+    inputs: PyTree = None,
 ) -> Predictive:
     """Draw the next k states and observations given y_1..y_t, parameters and states integrated out.
 
@@ -48,70 +48,44 @@ def posterior_predictive(
     The pair (θ, x_t) has the posterior distribution as exactly as θ alone has, for any N:
 
     - of `metropolis_hastings`, x_t is a particle of the run whose Ẑ was accepted (Andrieu, Doucet
-      and Holenstein 2010, section 2.4.2), which is made again with its key;
+      and Holenstein 2010, section 2.4.2), which is made again with its key, once for all draws
+      that share it;
     - of `particle_gibbs`, the end of the trajectory, which must be kept whole (`collect=None`);
     - of `smc2`, a particle of the sample's own filter. There are as many draws as samples, as one
       chain, resampled by their weights: those of `to_inference_data`.
 
+    - `num_trajectories`, as for `posterior_trajectories`: a few hundred of each chain do for
+      bands, and of `metropolis_hastings` each costs a run of the filter.
     - `inputs`: u_{t+1}, ..., u_{t+k}, as for `run_filter`.
 
     Raises `ValueError` for a model without `sample_observation(key, states)`, for trajectories that
     were not kept, and for a posterior given several sequences.
-    Use it for forecasts that count all that is not known; `forecast` is for known parameters.
+    Use it for forecasts that count all that is not known; `forecast` is for known parameters, and
+    `posterior_trajectories` for what happened.
     """
     problem: Any = posterior.problem
     require(problem.tree.model, "sample_observation", "posterior_predictive")
     inputs = steps_of_inputs(inputs, num_steps, problem.tree.model, "steps")
-    values, ends, draw_end = _ends(posterior, problem)
-    keys = jax.random.split(key, jax.tree.leaves(ends)[0].shape[:2])
-    found = _predict(problem, draw_end, (keys, values, ends), num_steps, inputs)
+    key_ends, key_steps = jax.random.split(key)
+    problem, values, ends = drawn_states(key_ends, posterior, num_trajectories, whole=False)
+    keys = jax.random.split(key_steps, jax.tree.leaves(ends)[0].shape[:2])
+    found = _predict(problem, keys, values, ends, num_steps, inputs)
     return Predictive(*jax.tree.map(np.asarray, found))
 
 
-@jit_on_wide_vectors
-def _predict(problem, draw_end, rows, num_steps, inputs):
-    def one(row: tuple[Array, PyTree, PyTree]) -> tuple[PyTree, PyTree]:
-        key, values, end = row
-        key_end, key_steps = jax.random.split(key)
-        filter = problem.having(values)
-        state = draw_end(key_end, problem, filter, end)
-        return steps_ahead(key_steps, filter.model, state, num_steps, inputs)
+# Compiling takes nearly all of the time.
+@partial(jit_on_wide_vectors, soon=True)
+def _predict(problem, keys, values, ends, num_steps, inputs):
+    def one(key: Array, values: PyTree, end: PyTree) -> tuple[PyTree, PyTree]:
+        state = jax.tree.map(lambda leaf: leaf[None], end)
+        return steps_ahead(key, problem.having(values).model, state, num_steps, inputs)
 
-    size = min(_TOGETHER, rows[0].shape[1])
-    return jax.lax.map(lambda chain: jax.lax.map(one, chain, batch_size=size), rows)
+    return jax.vmap(jax.vmap(one))(keys, values, ends)
 
 
-def _ends(posterior: Any, problem: Any) -> tuple[PyTree, PyTree, Callable[..., PyTree]]:
-    """Parameters, and what each x_t is drawn from, leaves (chains, draws, ...); and how."""
-    values = posterior.parameters
-    if isinstance(posterior, SequentialPosterior):
-        return *posterior.resampled((values, posterior.mixtures)), _of_mixture
-    if isinstance(posterior, GibbsPosterior):
-        kept = posterior.trajectories
-        if {leaf.shape[2:3] for leaf in jax.tree.leaves(kept)} != {posterior.renewed.shape[2:]}:
-            raise ValueError("posterior: its trajectories are not whole, as by collect=None")
-        return values, jax.tree.map(lambda leaf: leaf[:, :, -1:], kept), _of_trajectory
-    if [group.length for group in problem.objective.groups] != [1]:
-        raise ValueError("posterior: it is given several sequences, each with a future of its own")
-    return values, posterior.key_data, _of_run
-
-
-def _of_trajectory(key: Any, problem: Any, filter: Any, last: PyTree) -> PyTree:
-    return last
-
-
-def _of_mixture(key: Any, problem: Any, filter: Any, mixture: ParticleMixture) -> PyTree:
-    return mixture.at(draw(key, (1,), mixture.log_weights)).particles
-
-
-def _of_run(key: Any, problem: Any, filter: Any, key_data: Array) -> PyTree:
-    """From the run whose Ẑ was accepted, made again."""
-    key_run = jax.random.wrap_key_data(key_data, impl=jax.random.key_impl(key))
-    final = jax.tree.map(lambda leaf: leaf[0], problem.objective.runs(key_run, filter)[0].final)
-    return _of_mixture(key, problem, filter, final)
-
-
-def to_inference_data(result: Chains | PyTree, predictive: Predictive | None = None) -> Any:
+def to_inference_data(
+    result: Chains | PosteriorTrajectories | PyTree, predictive: Predictive | None = None
+) -> Any:
     """A posterior as ArviZ's own type, for its diagnostics and plots.
 
     It is an `InferenceData` with ArviZ before 1, and a `DataTree` of xarray from 1 on.
@@ -126,12 +100,16 @@ def to_inference_data(result: Chains | PyTree, predictive: Predictive | None = N
       equal weight (systematic resampling), in an order without meaning, as one chain. Samples of
       large weight are there several times, which ArviZ's effective sample size does not know:
       take `effective_sample_sizes`.
+    - of `posterior_trajectories`: `posterior` has the parameters and the trajectories as `state`,
+      `posterior_predictive` the new observations as `observation`, with a dimension
+      `observation_time`, and `observed_data` those that there were, NaN where missing: what
+      `arviz.plot_ppc` takes.
     - of trajectories, as `sample_trajectories` draws them: `posterior` has them as `state`, as
       draws of one chain. They are independent given the run.
 
-    With `predictive`, what `posterior_predictive` made of the same result, there is a group
-    `posterior_predictive`: y_{t+1}, ..., y_{t+k} as `observation` and the states as `state_ahead`,
-    with a dimension `ahead`, 1 to k.
+    With `predictive`, what `posterior_predictive` made of the same result, the group
+    `posterior_predictive` has y_{t+1}, ..., y_{t+k} as `observation_ahead` and the states as
+    `state_ahead`, with a dimension `ahead`, 1 to k.
 
     Raises `ImportError` where arviz is missing, `ValueError` for anything else. Use it for
     effective sample sizes and R-hat: `arviz.summary(to_inference_data(chains))`.
@@ -139,6 +117,8 @@ def to_inference_data(result: Chains | PyTree, predictive: Predictive | None = N
     arviz: Any = optional("arviz", "arviz")
     stats: dict[str, np.ndarray] = {}
     states: dict[str, np.ndarray] = {}
+    again: dict[str, np.ndarray] = {}
+    seen: dict[str, np.ndarray] = {}
     parameters = getattr(result, "parameters", {})
     if isinstance(result, Posterior):
         stats["log_marginal_likelihood"] = result.log_marginal_likelihoods
@@ -148,6 +128,12 @@ def to_inference_data(result: Chains | PyTree, predictive: Predictive | None = N
         stats = {"acceptance_rate": result.accepted, "renewed": result.renewed}
     elif isinstance(result, SequentialPosterior):
         parameters = result.resampled(parameters)
+    elif isinstance(result, PosteriorTrajectories):
+        states = _named("state", result.states)
+        again = _named("observation", result.observations)
+        seen = _named("observation", result.observed.observations)
+        if (present := result.observed.present) is not None:
+            seen = {name: _where_present(leaf, np.asarray(present)) for name, leaf in seen.items()}
     else:
         states = {name: leaf[None] for name, leaf in _named("state", result).items()}
         stacks = {leaf.shape[:3] if leaf.dtype.kind in "iufc" else () for leaf in states.values()}
@@ -155,17 +141,21 @@ def to_inference_data(result: Chains | PyTree, predictive: Predictive | None = N
             raise ValueError(f"result: {shown(result)} is no posterior of parameters or states")
     ahead: dict[str, np.ndarray] = {}
     if predictive is not None:
-        ahead = _named("observation", predictive.observations)
+        ahead = _named("observation_ahead", predictive.observations)
         ahead |= _named("state_ahead", predictive.states)
     length = stats["renewed"].shape[2] if "renewed" in stats else None
     dims, coords = {}, {}
-    for name, leaf in (states | stats | ahead).items():
-        if name in ahead or (leaf.ndim > 2 and length in (None, leaf.shape[2])):
-            time, first = ("ahead", 1) if name in ahead else ("time", 0)
+    times = dict.fromkeys(ahead, "ahead") | dict.fromkeys(again, "observation_time")
+    for name, leaf in (states | stats | again | ahead).items():
+        if name in times or (leaf.ndim > 2 and length in (None, leaf.shape[2])):
+            time, first = (times[name], 1) if name in times else ("time", 0)
             dims[name] = [time, *(f"{name}_dim_{k}" for k in range(1, leaf.ndim - 2))]
             coords[time] = first + np.arange(leaf.shape[2])
-    groups = {"posterior": parameters | states, "sample_stats": stats}
-    groups = {name: own for name, own in (groups | {"posterior_predictive": ahead}).items() if own}
+    groups = {
+        "posterior": parameters | states, "sample_stats": stats,
+        "posterior_predictive": again | ahead, "observed_data": seen,
+    }  # fmt: skip
+    groups = {name: own for name, own in groups.items() if own}
     if "posterior" in inspect.signature(arviz.from_dict).parameters:
         return arviz.from_dict(**groups, dims=dims, coords=coords)
     return arviz.from_dict(groups, dims=dims, coords=coords)
@@ -178,3 +168,9 @@ def _named(whole: str, tree: PyTree) -> dict[str, np.ndarray]:
         whole + re.sub(r"[^\w]+", "_", jax.tree_util.keystr(path)).rstrip("_"): np.asarray(leaf)
         for path, leaf in named
     }
+
+
+def _where_present(leaf: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """The observations, NaN in steps where they are missing."""
+    mask = present.reshape(-1, *[1] * (leaf.ndim - 1))
+    return np.where(mask, leaf, np.nan)

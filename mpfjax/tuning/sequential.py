@@ -66,6 +66,15 @@ class SequentialPosterior:
         """E[θ | y_1..y_t] of one parameter, estimated."""
         return np.asarray(np.einsum("n,n...->...", self.weights, self.parameters[name]))
 
+    @property
+    def filters(self) -> tuple[Problem, Series, Float[np.ndarray, " samples"]]:
+        """The problem with the filters' N, the data that they have seen, and log Ẑ of each."""
+        run, state = cast(tuple[_Run, State], self._goes_on)
+        samples, num_particles, _ = state.carry
+        seen = jax.tree.map(lambda leaf: leaf[: state.step], run.series)
+        problem = run.sampler.with_particles(num_particles).problem
+        return problem, seen, np.asarray(samples.particles.log_likelihood)
+
     def resampled(self, rows: PyTree) -> PyTree:
         """The rows of as many samples of equal weight (systematic), as of one chain: (1, n, ...).
 

@@ -22,7 +22,7 @@ FLOORS = {
     """,
     "vision": "files colour tracking boxes",
     "lookahead": "quadratics pilot twisted regression learned",
-    "running": "storage long_runs devices scan run islands studies",
+    "running": "storage long_runs devices scan run late islands studies",
 }
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

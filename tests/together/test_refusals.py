@@ -135,6 +135,7 @@ GOOD = {
     mpfjax.PropagateTempered: {"resample": Resample(), "exponents": (0.1, 1.0)},
     SelectInitial: {"num_draws": 2},
     mpfjax.RegroupOthers: {"regrouping": KMeans(1)},
+    mpfjax.Replay: {"filter": FILTER, "lag": 2},
     mpfjax.with_eve_indices: {
         "filter": mpfjax.particle_filter(MODEL, 4, scheme="multinomial")},
     Filter: {"model": MODEL, "moves": [Propagate()], "num_particles": 4},

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mpfjax import Series
 from mpfjax.tuning import to_inference_data
 from mpfjax.tuning.gibbs import GibbsPosterior
+from mpfjax.tuning.happened import PosteriorTrajectories
 from mpfjax.tuning.metropolis import Posterior
 from mpfjax.tuning.predictive import Predictive
 from mpfjax.tuning.sequential import SequentialPosterior
@@ -68,10 +70,26 @@ def test_of_particle_gibbs():
 def test_of_what_comes_next():
     ahead = Predictive({"speed": RNG.normal(size=(3, 50, 4))}, RNG.normal(size=(3, 50, 4, 2)))
     groups, dims, coords = to_inference_data(of_gibbs(), ahead)
-    assert set(groups["posterior_predictive"]) == {"observation", "state_ahead_speed"}
-    assert dims["observation"] == ["ahead", "observation_dim_1"]
+    assert set(groups["posterior_predictive"]) == {"observation_ahead", "state_ahead_speed"}
+    assert dims["observation_ahead"] == ["ahead", "observation_ahead_dim_1"]
     assert coords["ahead"].tolist() == [1, 2, 3, 4]
     assert coords["time"].tolist() == list(range(6))
+
+
+def test_of_what_happened():
+    seen, again = RNG.normal(size=5), RNG.normal(size=(3, 50, 5))
+    present = np.arange(5) != 2
+    past = PosteriorTrajectories(PARAMETERS, STATES, again, Series(seen, present=present))
+    groups, dims, coords = to_inference_data(past)
+    assert set(groups["posterior"]) == {"a", "b", "state_position", "state_speed"}
+    assert dims["state_speed"] == ["time"]
+    assert coords["time"].tolist() == list(range(6))
+    assert dims["observation"] == ["observation_time"]
+    assert coords["observation_time"].tolist() == [1, 2, 3, 4, 5]
+    np.testing.assert_array_equal(groups["posterior_predictive"]["observation"], again)
+    observed = groups["observed_data"]["observation"]
+    np.testing.assert_array_equal(observed, np.where(present, seen, np.nan))
+    assert "posterior_predictive" not in to_inference_data(past._replace(observations=None))[0]
 
 
 def test_of_smc2_samples_count_as_often_as_they_weigh():

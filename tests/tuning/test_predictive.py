@@ -11,8 +11,14 @@ from jax.scipy.stats import norm
 
 import mpfjax
 from mpfjax import Series
-from mpfjax.exact import kalman_filter
-from mpfjax.tuning import metropolis_hastings, particle_gibbs, posterior_predictive, smc2
+from mpfjax.exact import kalman_filter, kalman_smoother
+from mpfjax.tuning import (
+    metropolis_hastings,
+    particle_gibbs,
+    posterior_predictive,
+    posterior_trajectories,
+    smc2,
+)
 from mpfjax.tuning.evidence import pose_evidence
 from tests.marking import exactness
 from tests.tuning.exact_posteriors import Pushed
@@ -41,16 +47,26 @@ CHAINS = {"num_chains": 100, "burn_in": 30} | OF_D
 
 
 def exact_moments():
-    """Of x and y after the last observation, by a Kalman filter of the state (x, d)."""
+    """Of x and y after the last observation, and of x from x_0 and y before, given what was seen.
+
+    By a Kalman filter, and smoother, of the state (x, d).
+    """
     m = jax.tree.map(float, Drifting())
     model = mpfjax.LinearGaussianModel(
         A=[[m.a, 1.0], [0.0, 1.0]], Q=np.diag([m.q**2, 0.0]), B=[[1.0], [0.0]],
         H=[[m.h, 0.0]], R=[[m.r**2]], m0=[m.m, 0.0], P0=np.diag([m.p**2, 1.0]),
     )  # fmt: skip
     found = kalman_filter(model, mpfjax.Series.skipping(SEEN[:, None], INPUTS[:, None]))
-    mean, variance = np.asarray(found.means)[:, 0], np.asarray(found.covariances)[:, 0, 0]
-    mean, variance = mean[-NUM_STEPS:], variance[-NUM_STEPS:]
-    return [(mean, variance), (m.h * mean, m.h**2 * variance + m.r**2)]
+    past = Series(SERIES.observations[:, None], SERIES.inputs[:, None], skips_missing=True)
+    past = kalman_smoother(model, past)
+    ahead = found.means[-NUM_STEPS:, 0], found.covariances[-NUM_STEPS:, 0, 0]
+    past = past.means[:, 0], past.covariances[:, 0, 0]
+
+    def of_observations(mean, variance):
+        return m.h * mean, m.h**2 * variance + m.r**2
+
+    moments = ahead, of_observations(*ahead), past, of_observations(past[0][1:], past[1][1:])
+    return jax.tree.map(np.asarray, moments)
 
 
 def log_prior(parameters):
@@ -94,17 +110,74 @@ def by_smc2():
     return smc2(KEY, FILTER, SERIES, 4000, num_moves=3, **PRIOR, **OF_D)
 
 
+def z_scores(values, mean, variance, independent=None):
+    """Of means and variances over chains, or over so many `independent` draws of one chain."""
+    moments = np.stack([values - mean, (values - mean) ** 2 - variance])
+    if independent is not None:
+        error = moments.std(axis=2) / np.sqrt(independent)
+    else:
+        error = moments.mean(axis=2).std(axis=1, keepdims=True) / np.sqrt(len(values))
+    return moments.mean(axis=(1, 2)) / error[:, 0]
+
+
 @pytest.mark.parametrize("sample", [by_metropolis, *exactness([by_gibbs, by_smc2])])
 def test_means_and_variances_are_the_exact_ones(sample):
     """Within four standard errors, over chains; of `smc2`, by its effective sample size."""
     run = sample()
-    found = posterior_predictive(jax.random.key(1), run, NUM_STEPS, inputs=INPUTS[-NUM_STEPS:])
+    ahead = posterior_predictive(jax.random.key(1), run, NUM_STEPS, inputs=INPUTS[-NUM_STEPS:])
+    past = posterior_trajectories(jax.random.key(2), run)
+    found = *ahead, past.states, past.observations
     for values, (mean, variance) in zip(found, exact_moments(), strict=True):
-        moments = np.stack([values - mean, (values - mean) ** 2 - variance])
-        if sample is by_smc2:
-            error = moments.std(axis=2) / np.sqrt(run.effective_sample_sizes.min())
-        else:
-            error = moments.mean(axis=2).std(axis=1, keepdims=True) / np.sqrt(len(values))
-        z = moments.mean(axis=(1, 2)) / error[:, 0]
-        assert z.shape == (2, NUM_STEPS)
+        independent = run.effective_sample_sizes.min() if sample is by_smc2 else None
+        z = z_scores(values, mean, variance, independent)
+        assert z.shape == (2, len(mean))
+        assert np.abs(z).max() < 4, z
+
+
+class Steps(mpfjax.AbstractStateSpaceModel):
+    """A place of which the steps are seen, x_t - x_{t-1}: the state carries the last one."""
+
+    d: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
+
+    def sample_initial(self, key, num_particles):
+        places = jax.random.normal(key, (num_particles,))
+        return jnp.column_stack([places, jnp.zeros(num_particles)])
+
+    def sample_transition(self, key, states):
+        before = states[:, 0]
+        places = 0.8 * before + self.d + 0.7 * jax.random.normal(key, before.shape)
+        return jnp.column_stack([places, places - before])
+
+    def log_likelihood(self, observation, states):
+        return norm.logpdf(observation, states[:, 1], 0.5)
+
+    def sample_observation(self, key, states):
+        return states[:, 1] + 0.5 * jax.random.normal(key, states[:, 1].shape)
+
+
+@pytest.mark.exactness
+def test_what_is_seen_of_a_step_is_a_number_of_the_state():
+    """Places and steps, by the genealogy, beside the Kalman smoother of (x_t, x_{t-1}, d)."""
+    seen = np.float32([1.2, 0.3, 0.8])
+    run = metropolis_hastings(
+        KEY, mpfjax.particle_filter(Steps(), 20), seen, 200, proposal_deviations=0.8, **PRIOR,
+        **CHAINS,
+    )  # fmt: skip
+    exact = kalman_smoother(
+        mpfjax.LinearGaussianModel(
+            A=[[0.8, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], Q=np.diag([0.49, 0.0, 0.0]),
+            H=[[1.0, -1.0, 0.0]], R=[[0.25]], m0=np.zeros(3), P0=np.eye(3),
+        ), seen[:, None],
+    )  # fmt: skip
+    past = posterior_trajectories(jax.random.key(1), run)
+    step = np.float32([1.0, -1.0, 0.0])
+    means, covariances = np.asarray(exact.means), np.asarray(exact.covariances)
+    variances = np.einsum("i,tij,j->t", step, covariances, step)[1:]
+    expected = [
+        (past.states[..., 0], means[:, 0], covariances[:, 0, 0]),
+        (past.states[:, :, 1:, 1], means[1:] @ step, variances),
+        (past.observations, means[1:] @ step, variances + 0.25),
+    ]
+    for values, mean, variance in expected:
+        z = z_scores(values, mean, variance)
         assert np.abs(z).max() < 4, z

@@ -1,0 +1,224 @@
+"""What happened, over the posterior of parameters and states: whole trajectories, or their ends."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import Count, checked
+from mpfjax.filter import check_keep_parents
+from mpfjax.models.base import with_inputs
+from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.observations import Series
+from mpfjax.operations.compiling import jit_on_wide_vectors
+from mpfjax.smoothing.backward import draw
+from mpfjax.smoothing.conditional import draw_trajectory, shape_of_trajectory
+from mpfjax.tuning.evidence import LogEvidence
+from mpfjax.tuning.gibbs import GibbsPosterior
+from mpfjax.tuning.metropolis import Posterior
+from mpfjax.tuning.sequential import SequentialPosterior
+
+Chains = Posterior | GibbsPosterior | SequentialPosterior
+
+_TOGETHER = 64  # of the draws that share a program's step
+_MOST_BYTES = 2**27  # of the mixtures of runs that are held at once
+_METHOD = "posterior_trajectories"
+
+
+class PosteriorTrajectories(NamedTuple):
+    """Draws of parameters and states given y_1..y_t, all of equal weight."""
+
+    parameters: dict[str, np.ndarray]
+    """by name, on their own scale: shape (chains, draws, ...)."""
+    states: PyTree
+    """x_0, ..., x_t, leaves (chains, draws, t + 1, ...)."""
+    observations: PyTree
+    """what could have been observed as well, given these states: leaves (chains, draws, t, ...).
+    None of a model without `sample_observation`."""
+    observed: Series
+    """y_1, ..., y_t, as the sampler was given them."""
+
+
+@checked
+def posterior_trajectories(
+    key: Key[Array, ""], posterior: Chains, num_trajectories: Count | None = None
+) -> PosteriorTrajectories:
+    """Draw x_0, ..., x_t and new observations given y_1..y_t, the parameters integrated out.
+
+    For each draw of θ there is one trajectory from p(x_0, ..., x_t | y_1..y_t, θ), and for each
+    state x_s one observation from p(y_s | x_s, θ): quantiles over draws are bands of what happened,
+    and of what could have been observed (a posterior predictive check).
+
+    - of `metropolis_hastings`, the run whose Ẑ was accepted is made again with its key, once for
+      all draws that share it, and leaves one trajectory. The pair has the posterior distribution as
+      exactly as θ alone, for any N (Andrieu, Doucet and Holenstein 2010, section 2.4.2);
+    - of `particle_gibbs`, the trajectories, which must be kept whole (`collect=None`);
+    - of `smc2`, each sample gets a filter over all observations anew, and the weight Ẑ of the new
+      one over Ẑ of its own (Chopin, Jacob and Papaspiliopoulos 2013, section 3.6): right as the
+      number of samples grows. The draws are one chain, resampled by these weights.
+
+    Trajectories are drawn by backward sampling, or of a model without `log_transition` by the
+    genealogy.
+
+    - `num_trajectories`: how many of each chain, evenly spaced; None is one for each draw of θ. A
+      few hundred do for bands, and each costs a run of the filter.
+
+    Raises `ValueError` for trajectories that were not kept, a posterior given several sequences,
+    and a conditionally linear model. Use it for the past with its uncertainty;
+    `sample_trajectories` is for known parameters, and `posterior_predictive` for what comes next.
+    """
+    key_paths, key_seen = jax.random.split(key)
+    problem, values, paths = drawn_states(key_paths, posterior, num_trajectories, whole=True)
+    series, seen = _series_of(posterior), None
+    if callable(getattr(problem.tree.model, "sample_observation", None)):
+        keys = jax.random.split(key_seen, jax.tree.leaves(paths)[0].shape[:2])
+        seen = _in_numpy(_observe(problem, series.inputs, keys, values, paths))
+    return PosteriorTrajectories(values, paths, seen, series)
+
+
+def drawn_states(
+    key: Key[Array, ""], posterior: Any, number: int | None, whole: bool
+) -> tuple[Any, dict[str, np.ndarray], PyTree]:
+    """The problem, parameters, and a trajectory for each, or x_t alone: (chains, draws, ...)."""
+    problem, values = posterior.problem, posterior.parameters
+    if isinstance(posterior, GibbsPosterior):
+        kept = posterior.trajectories
+        if {leaf.shape[2:3] for leaf in jax.tree.leaves(kept)} != {posterior.renewed.shape[2:]}:
+            raise ValueError("posterior: its trajectories are not whole, as by collect=None")
+        values, kept = _thinned((values, kept), number)
+        return problem, values, kept if whole else jax.tree.map(lambda leaf: leaf[:, :, -1], kept)
+    if isinstance(posterior, SequentialPosterior):
+        problem, series, log_likelihoods = posterior.filters
+        evidence = LogEvidence([jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], series)])
+        if not whole:
+            rows = posterior.resampled((values, posterior.mixtures))
+            values, mixtures = _thinned(rows, number)
+            keys = jax.random.split(key, mixtures.log_weights.shape[:2])
+            return problem, values, _in_numpy(_of_mixtures(keys, mixtures))
+        keys = jax.random.split(key, (2, len(log_likelihoods)))
+        paths, new = _run_again(problem, evidence, (keys[0], values, keys[1]), whole)
+        gains = np.where(np.isfinite(log_likelihoods), new - log_likelihoods, -np.inf)
+        log_weights = posterior.log_weights + gains
+        log_weights -= np.logaddexp.reduce(log_weights)
+        weighed = replace(posterior, log_weights=log_weights)
+        return problem, *_thinned(weighed.resampled((values, paths)), number)
+    if [group.length for group in problem.objective.groups] != [1]:
+        raise ValueError("posterior: it is given several sequences, each with its own states")
+    values, key_data = _thinned((values, posterior.key_data), number)
+    # Steps that were rejected have the run of the step before, and its trajectory.
+    flat, shape = _in_one_row(key_data), key_data.shape[:2]
+    _, first, place = np.unique(flat, axis=0, return_index=True, return_inverse=True)
+    rows = _taken(jax.tree.map(_in_one_row, values), first)
+    keys = jax.random.wrap_key_data(jnp.asarray(flat[first]), impl=jax.random.key_impl(key))
+    own = jax.random.split(key, len(first))
+    paths, _ = _run_again(problem, problem.objective, (own, rows, keys), whole)
+    return problem, values, _taken(paths, place.reshape(shape))
+
+
+def _in_numpy(tree: PyTree) -> PyTree:
+    """The same in arrays of numpy."""
+    return jax.tree.map(np.asarray, tree)
+
+
+def _series_of(posterior: Any) -> Series:
+    if isinstance(posterior, SequentialPosterior):
+        return posterior.filters[1]
+    objective = posterior.problem.objective
+    if isinstance(posterior, GibbsPosterior):
+        return objective.series
+    return jax.tree.map(lambda leaf: leaf[0], objective.groups[0])
+
+
+def _taken(rows: PyTree, places: np.ndarray) -> PyTree:
+    return jax.tree.map(lambda leaf: leaf[places], rows)
+
+
+def _in_one_row(leaf: Any) -> Any:
+    """All chains one after the other."""
+    return leaf.reshape(-1, *leaf.shape[2:])
+
+
+def _thinned(rows: PyTree, number: int | None) -> PyTree:
+    """So many draws of each chain, evenly spaced, or all where there are no more."""
+    length = jax.tree.leaves(rows)[0].shape[1]
+    if number is None or number >= length:
+        return rows
+    chosen = (np.arange(number) + 1) * length // number - 1
+    return jax.tree.map(lambda leaf: leaf[:, chosen], rows)
+
+
+def _run_again(
+    problem: Any, evidence: LogEvidence, rows: tuple[Any, Any, Any], whole: bool
+) -> tuple[PyTree, Float[np.ndarray, " rows"]]:
+    """What one state, or trajectory, of each filter's run is, and its log Ẑ.
+
+    Rows are a key, parameters, and the key of the run.
+    """
+    filter, length = problem.tree, evidence.groups[0].observations
+    length = jax.tree.leaves(length)[0].shape[1] + 1
+    backward = callable(getattr(filter.model, "log_transition", None))
+    size = _TOGETHER
+    if whole:
+        refuse_marginalised(filter.model, _METHOD, "sample_trajectories takes it")
+        if not backward:
+            check_keep_parents("posterior", filter.moves, f"{_METHOD} without log_transition")
+        path = jax.tree.leaves(shape_of_trajectory(filter.model, length))
+        each = sum(leaf.size * leaf.dtype.itemsize for leaf in path) + 16 * length
+        size = int(np.clip(_MOST_BYTES // (each * filter.num_particles), 1, _TOGETHER))
+    # Whole batches, so that one program does for any number of rows: compiling takes the time.
+    number, parts = rows[0].shape[0], []
+    for first in range(0, number, size):
+        batch = _taken(rows, np.arange(first, first + size) % number)
+        parts.append(_in_numpy(_runs_again(problem, evidence, batch, whole, backward)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *parts)
+
+
+@jit_on_wide_vectors
+def _runs_again(problem, evidence, rows, whole, backward):
+    (group,) = evidence.groups
+    inputs = jax.tree.map(lambda leaf: leaf[0], group.inputs)
+
+    def one(row: tuple[Array, PyTree, Array]) -> tuple[PyTree, Array]:
+        key, values, key_run = row
+        filter = problem.having(values)
+        (runs,) = evidence.runs(key_run, filter, whole)
+        run = jax.tree.map(lambda leaf: leaf[0], runs)
+        if whole:
+            states = draw_trajectory(key, filter.model, run, inputs, backward, checked=False)
+        else:
+            states = _one_of(key, run.final)
+        return states, run.log_marginal_likelihood
+
+    return jax.vmap(one)(rows)
+
+
+@partial(jit_on_wide_vectors, soon=True)
+def _of_mixtures(keys, mixtures):
+    return jax.vmap(jax.vmap(_one_of))(keys, mixtures)
+
+
+def _one_of(key: Key[Array, ""], mixture: Any) -> PyTree:
+    """A particle by its weight."""
+    (place,) = draw(key, (1,), mixture.log_weights)
+    return jax.tree.map(lambda leaf: leaf[place], mixture.particles)
+
+
+@partial(jit_on_wide_vectors, soon=True)
+def _observe(problem, inputs, keys, values, paths):
+    def one(key: Array, values: PyTree, path: PyTree) -> PyTree:
+        model = problem.having(values).model
+        after = jax.tree.map(lambda leaf: leaf[1:], path)
+        keys = jax.random.split(key, jax.tree.leaves(after)[0].shape[0])
+
+        def seen(key: Array, now: PyTree, state: PyTree) -> PyTree:
+            alone = jax.tree.map(lambda leaf: leaf[None], state)
+            observation = with_inputs(model, now).sample_observation(key, alone)
+            return jax.tree.map(lambda leaf: leaf[0], observation)
+
+        return jax.vmap(seen)(keys, inputs, after)
+
+    return jax.vmap(jax.vmap(one))(keys, values, paths)
