@@ -109,6 +109,13 @@ class OccupancyGrid(Fitting):
         rows, columns, inside = self.cells(places)
         return jnp.where(inside, values[rows, columns], outside)
 
+    def distance_at(self, places: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
+        """Metres to the nearest occupied cell; off the map by way of the nearest cell on it."""
+        rows, columns, inside = self.cells(places)
+        x = places[..., 0] - self.origin[0] - self.resolution * (columns.astype(places.dtype) + 0.5)
+        y = places[..., 1] - self.origin[1] - self.resolution * (rows.astype(places.dtype) + 0.5)
+        return self.distances[rows, columns] + jnp.where(inside, 0.0, jnp.sqrt(x**2 + y**2))
+
     def ranges(self, poses: Poses, angles: Angles, max_range: float) -> Float[Array, "n b"]:
         """Metres from each pose to the first occupied cell along each angle, or `max_range`.
 
@@ -129,7 +136,7 @@ class OccupancyGrid(Fitting):
 
         def advance(carry: tuple[Array, Array]) -> tuple[Array, Array]:
             reach, _ = carry
-            gaps = self.at(_ends(poses, angles, reach), self.distances, jnp.inf)
+            gaps = self.distance_at(_ends(poses, angles, reach))
             steps = jnp.where(gaps > 0, jnp.maximum(gaps - diagonal, least), 0.0)
             farther = jnp.minimum(reach + steps, max_range)
             return farther, jnp.any(farther > reach)
@@ -277,7 +284,7 @@ class LikelihoodField(AbstractLaser):
         self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid
     ) -> Float[Array, "n b"]:
         """By the distance of each beam's end to the nearest occupied cell."""
-        gaps = grid.at(_ends(poses, angles, ranges[None]), grid.distances, jnp.inf)
+        gaps = grid.distance_at(_ends(poses, angles, ranges[None]))
         hit = jnp.exp(log_normal(jnp.minimum(gaps, self.laser_likelihood_max_dist), self.sigma_hit))
         density = self.z_hit * hit + self.z_rand / self.laser_max_range
         logs = jnp.log(density / (self.z_hit + self.z_rand))

@@ -44,10 +44,11 @@ def cell(x, y):
 
 def gap(x, y):
     """Metres to the nearest occupied cell, at most those of the field."""
-    here, most = cell(x, y), 0.8
-    if here is None:
-        return most
-    return min(most, CELL * np.min(np.hypot(*(np.argwhere(WALLS) - here).T)))
+    column, row = np.floor((x + 1.0) / CELL), np.floor((y - 2.0) / CELL)
+    here = np.array([np.clip(row, 0, 29), np.clip(column, 0, 39)])
+    beyond = np.hypot(x + 1.0 - CELL * (here[1] + 0.5), y - 2.0 - CELL * (here[0] + 0.5))
+    beyond *= cell(x, y) is None
+    return min(0.8, beyond + CELL * np.min(np.hypot(*(np.argwhere(WALLS) - here).T)))
 
 
 def cast(x, y, heading):
