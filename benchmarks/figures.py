@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
 from mpfjax.plotting import COLOURS, MARKERS
+from mpfjax.vision.files.drawing import PALETTE
 
 
 def draw_typical_run(
@@ -62,7 +64,10 @@ def _draw_history(axis: Axes, history: Mapping[str, Any], truth: np.ndarray) -> 
 
 
 def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str]) -> Figure:
-    """Figure 2 of Vermaak et al. (2003), and the error of the modes' mass beside it."""
+    """Figure 2 of Vermaak et al. (2003), and the error of the modes' mass beside it.
+
+    The mass is that of the upper mode, which is 1/2 by symmetry.
+    """
     entries = sorted(results, key=lambda entry: list(labels).index(entry["filter"]))
 
     def score(entry: Mapping[str, Any], k: int) -> float:
@@ -70,21 +75,16 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
         return float(np.clip(np.mean(entry["scores"]) + k * np.std(entry["scores"]), 0, 1))
 
     scores = [lambda e, k=k: score(e, k) for k in (0, -1, 1)]
-    masses = [lambda e, k=k: e["mass_mean"] + k * e["mass_std"] for k in (0, -1, 1)]
     at = (lambda e: labels[e["filter"]], "particles")
-    x, limits = "number of particles $N$", (-0.03, 1.06)
+    x = "number of particles $N$"
     panels = [
         Panel(
             f"score, mean ± std of {len(results[0]['scores'])} runs", x,
             "share of steps with both modes",
-            lines_of(entries, *at, *scores), limits,
+            lines_of(entries, *at, *scores), (-0.03, 1.06),
         ),
         Panel(
-            "probability of the upper mode, mean ± std", x, r"$P(x_t > 0 \mid y_1 \ldots y_t)$",
-            lines_of(entries, *at, *masses), limits,
-        ),
-        Panel(
-            "its RMS error", x, r"error of $P(x_t > 0 \mid y_1 \ldots y_t)$",
+            "probability of the upper mode", x, r"RMS error of $P(x_t > 0 \mid y_1 \ldots y_t)$",
             lines_of(entries, *at, "mode_mass_error"), (0, None),
         ),
     ]  # fmt: skip
@@ -92,17 +92,19 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
 
 
 def draw_contact_sheet(
-    columns: Sequence[tuple[str, Sequence[np.ndarray]]], titles: Sequence[str]
+    columns: Sequence[tuple[str, Sequence[np.ndarray]]],
+    titles: Sequence[str],
+    legend: Mapping[str, int],
 ) -> Figure:
     """Figure 3 of Vermaak et al. (2003): a named column of pictures for each filter.
 
     Each column is a name and its RGB pictures, all of one size, one for each of the `titles`, which
-    stand beside the pictures.
+    stand beside the pictures. `legend` says what is drawn in the colour of which number.
     """
     height, width, _ = columns[0][1][0].shape
     panel = 10.0 / len(columns)
     figure = Figure(
-        figsize=(10.0, (panel * height / width + 0.1) * len(titles) + 0.3), layout="constrained"
+        figsize=(10.0, (panel * height / width + 0.1) * len(titles) + 0.7), layout="constrained"
     )
     axes = figure.subplots(len(titles), len(columns), squeeze=False)
     for column, (name, pictures) in zip(axes.T, columns, strict=True):
@@ -112,6 +114,11 @@ def draw_contact_sheet(
             axis.set(xticks=[], yticks=[])
     for axis, title in zip(axes[:, 0], titles, strict=True):
         axis.set_ylabel(title, fontsize=12)
+    marks = [
+        Line2D([], [], ls="", marker="s", ms=8, mec="black", mfc=np.divide(PALETTE[number], 255))
+        for number in legend.values()
+    ]
+    figure.legend(marks, legend, loc="outside upper center", ncols=len(marks), fontsize=12)
     return figure
 
 
@@ -216,13 +223,13 @@ def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[st
         elif ends:
             # Shifted a little, so that intervals at the same place do not cover each other.
             shift = index - (len(names) - 1) / 2
-            x = x * 1.04**shift if scales[0] == "log" else x + 0.06 * step * shift
-            reach = np.maximum([y - ends[0], ends[1] - y], 0)
-            axis.errorbar(x, y, reach, capsize=3, **style)
+            beside = x * 1.04**shift if scales[0] == "log" else x + 0.06 * step * shift
+            axis.vlines(beside, *ends, color=style["color"], lw=style["lw"])
+            axis.plot(x, y, **style)
         else:
             axis.plot(x, y, **style)
     axis.set(xscale=scales[0], yscale=scales[1], xlabel=panel.xlabel, ylabel=panel.ylabel)
-    axis.set_title(textwrap.fill(panel.title, 42), fontsize=9)
+    axis.set_title(textwrap.fill(panel.title, 36), fontsize=9)
     if len(ticks) <= 6:
         labels = [f"{tick:,.10g}".replace(",", "\u2009") for tick in ticks]
         axis.set_xticks(ticks, labels, fontsize=8)

@@ -310,7 +310,8 @@ def draw_migration(fewest: dict[str, Step], targets: Targets) -> Any:
         if name != "gpf"
     ]
     titles = [f"frame {targets.first + t}" for t in chosen]
-    return plotting.draw_contact_sheet(columns, titles)
+    legend = {f"particles that stand for target {k + 1}": k for k in (0, 1)}
+    return plotting.draw_contact_sheet(columns, titles, legend)
 
 
 def _annotated(still: np.ndarray, step: Step, t: int, crop: tuple[slice, slice]) -> np.ndarray:
@@ -318,7 +319,7 @@ def _annotated(still: np.ndarray, step: Step, t: int, crop: tuple[slice, slice])
     image, draw = drawing.canvas_of(still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1))
     corner = np.array([crop[1].start, crop[0].start], float)
     places = zoom * (step.centres[0, t] - corner)
-    drawing.draw_points(draw, places, step.target[0, t], 1.2 * zoom)
+    drawing.draw_points(draw, places, step.target[0, t], 0.5 * zoom)
     return np.asarray(image)
 
 

@@ -10,7 +10,7 @@ from benchmarks.harness import write_figure
 from benchmarks.visual_tracking.source import Source
 from mpfjax.vision.boxes.following import Snapshot, annotate
 from mpfjax.vision.files import boxes as box_files
-from mpfjax.vision.files import frames
+from mpfjax.vision.files import drawing, frames
 
 NAMES = {
     "pf": "Particle filter",
@@ -18,6 +18,7 @@ NAMES = {
     "gm_mpf": "Gaussian mixture particle filter",
 }
 KEY_FRAMES = 4
+LEGEND = {"particles": 1, "mean box of a component": 2}  # and the numbers of their colours
 
 
 def write_video(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) -> None:
@@ -47,9 +48,23 @@ def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snap
     columns = [
         (
             NAMES[name],
-            [annotate(stills[t], snapshots[t], zoom, crop) for t in chosen],
+            [annotated(stills[t], snapshots[t], zoom, crop) for t in chosen],
         )
         for name, snapshots in tracked.items()
     ]
     titles = [f"frame {source.first + t}" for t in chosen]
-    write_figure(path, draw_contact_sheet(columns, titles), dpi=110)
+    write_figure(path, draw_contact_sheet(columns, titles, LEGEND), dpi=110)
+
+
+def annotated(
+    still: np.ndarray, snapshot: Snapshot, zoom: int, crop: tuple[slice, slice]
+) -> np.ndarray:
+    """A crop with all particles in one colour, and all boxes in another."""
+    image, draw = drawing.canvas_of(still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1))
+    corner = np.array([crop[1].start, crop[0].start], float)
+    of_points, of_boxes = LEGEND.values()
+    points = zoom * (snapshot.points[0][snapshot.labels[0] >= 0] - corner)
+    drawing.draw_points(draw, points, np.full(len(points), of_points), 0.5 * zoom)
+    for box in box_files.top_left(snapshot.means[0][snapshot.active[0]]):
+        drawing.draw_box(draw, zoom * (box - [*corner, 0, 0]), of_boxes)
+    return np.asarray(image)

@@ -136,7 +136,7 @@ def annotate(
         drawing.draw_box(draw, zoom * box, int(m))
     filled = snapshot.labels[0] >= 0
     points = zoom * (snapshot.points[0][filled] - corner)
-    drawing.draw_points(draw, points, snapshot.labels[0][filled], 0.9 * zoom)
+    drawing.draw_points(draw, points, snapshot.labels[0][filled], 0.5 * zoom)
     return np.asarray(image)
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, UInt8
 
 # Okabe and Ito's palette, in the order of use; people with colour blindness can tell it apart. In
 # place of black, which numbers on a dark plate cannot have, there is a light green.
-_PALETTE = (
+PALETTE = (
     (230, 159, 0), (86, 180, 233), (240, 228, 66), (204, 121, 167), (0, 114, 178),
     (213, 94, 0), (0, 158, 115), (255, 255, 255), (153, 153, 153), (170, 255, 195),
 )  # fmt: skip
@@ -29,7 +29,7 @@ def draw_box(draw: Any, box: Float[np.ndarray, "4"], number: int, thickness: int
     """Outline a box (x, y, w, h), (x, y) its top-left corner, in the colour of a number."""
     x, y, w, h = box.tolist()
     corners = (round(x), round(y), round(x + w), round(y + h))
-    draw.rectangle(corners, outline=_PALETTE[number % len(_PALETTE)], width=thickness)
+    draw.rectangle(corners, outline=PALETTE[number % len(PALETTE)], width=thickness)
 
 
 def draw_points(
@@ -40,7 +40,7 @@ def draw_points(
 ) -> None:
     """Draw a dot at each (x, y), with a dark rim so that it is visible on any background."""
     for (x, y), number in zip(points.tolist(), numbers.tolist(), strict=True):
-        for reach, ink in ((radius + 1, (0, 0, 0)), (radius, _PALETTE[number % len(_PALETTE)])):
+        for reach, ink in ((radius + 1, (0, 0, 0)), (radius, PALETTE[number % len(PALETTE)])):
             ends = (round(x - reach), round(y - reach), round(x + reach), round(y + reach))
             draw.rectangle(ends, fill=ink)
 
@@ -63,5 +63,5 @@ def with_tracks(
         draw_box(draw, box, number, thickness)
         place = (max(box[0], 0), max(box[1], size + 4))
         draw.rectangle(draw.textbbox(place, str(number), font, anchor="lb"), fill=(40, 40, 40))
-        draw.text(place, str(number), _PALETTE[number % len(_PALETTE)], font, anchor="lb")
+        draw.text(place, str(number), PALETTE[number % len(PALETTE)], font, anchor="lb")
     return np.asarray(image)
