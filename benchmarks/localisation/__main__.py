@@ -35,7 +35,7 @@ from benchmarks import figures as plotting
 from benchmarks import harness
 from benchmarks.harness import AtLeast2, Seed, command
 from benchmarks.localisation.filters import NAMES, run
-from benchmarks.localisation.scenes import ROOMS, SCENES, Stretch
+from benchmarks.localisation.scenes import ROOMS, SCENES, Scene, Stretch
 
 TABLES = {
     "right at the end": "{right:.2f} ± {right_error:.2f}",
@@ -71,10 +71,11 @@ def main(
     """
     settings, rows = harness.settings_of(locals()), []
     for name in scenes:
-        model, drives = SCENES[name](seed, steps)
+        scene = SCENES[name](seed, steps)
+        drives = scene.drives
         for filter in filters:
             found = [
-                follow(name, model, filter, pair, particles, components, seeds, 4 * seed + number)
+                follow(name, scene, filter, pair, particles, components, seeds, 4 * seed + number)
                 for number, pair in enumerate(zip(drives, drives[1:] + drives[:1], strict=True))
             ]
             rows.append({"scene": name, "filter": filter, **summary(found, len(drives[0].poses))})
@@ -98,20 +99,20 @@ class Found(NamedTuple):
 
 
 def follow(
-    scene: str, model: Any, filter: str, drives: tuple[Stretch, Stretch], size: int,
+    name: str, scene: Scene, filter: str, drives: tuple[Stretch, Stretch], size: int,
     components: int, seeds: int, seed: int,
 ) -> Found:  # fmt: skip
     """Runs of a filter on a drive, after which the robot is carried to the start of another."""
     both = map(np.concatenate, zip(*drives, strict=True))
     motion, deviations, poses, seen = (jnp.asarray(part, jnp.float32) for part in both)
     keys, given = jax.random.split(jax.random.key(seed), seeds), (seen, (motion, deviations))
-    particles, logs, increments = run(filter, model, size, components, keys, given)
+    particles, logs, increments = run(filter, scene.model, size, components, keys, given)
     x, y, turn = jnp.moveaxis(particles - poses[None, :, None], -1, 0)
     turned = jnp.abs((turn + jnp.pi) % (2 * jnp.pi) - jnp.pi)
-    near = (jnp.hypot(x, y) < model.near) & (turned < 0.4)
+    near = (jnp.hypot(x, y) < scene.near) & (turned < 0.4)
     right = jnp.sum(jnp.where(near, jnp.exp(logs), 0.0), axis=-1) > 0.5
     log_z = jnp.sum(increments[:, : len(drives[0].poses)], axis=1)
-    rooms, masses = ROOMS.get(scene), None
+    rooms, masses = ROOMS.get(name), None
     if rooms and not rooms.pillar:
         carried = len(drives[0].poses)
         at = np.minimum([carried - 1, carried - 1 + LATER], len(poses) - 1)

@@ -93,16 +93,10 @@ def replace_some(
     return mixture.replace(particles=jnp.where(is_new, drawn, mixture.particles))
 
 
-def features(states: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
-    """By which hypotheses are told apart."""
-    return jnp.stack([*states[:, :2].T, jnp.cos(states[:, 2]), jnp.sin(states[:, 2])], axis=1)
-
-
 def mixture(model: Any, num_particles: int, max_components: int) -> mpfjax.Filter:
-    """By default, but for what tells hypotheses apart."""
-    return mpfjax.mixture_particle_filter(
-        model, num_particles, max_components, features=features, scale=(1.0, 1.0, 0.5, 0.5)
-    )
+    """Units are those of x, y, and the cosine and sine of the heading."""
+    scale = (1.0, 1.0, 0.5, 0.5)
+    return mpfjax.mixture_particle_filter(model, num_particles, max_components, scale=scale)
 
 
 FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {

@@ -1,29 +1,28 @@
 """Where a robot is lost: real buildings and a public map, where the data are, an office, a ring.
 
 The data are in the folder that MPFJAX_DATA names, or in ../shared/data: laser logs of buildings in
-logs/, TurtleBot3's world in maps/. The likelihoods are those of the READMEs there.
+logs/, TurtleBot3's world in maps/. The likelihoods of the buildings are those of the README there.
 """
 
 import os
-import re
 import runpy
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
-from scipy.ndimage import distance_transform_edt
+from jaxtyping import Array, Float, Key
 
 import mpfjax
+from mpfjax import robots
 
 DATA = Path(os.environ.get("MPFJAX_DATA", "../shared/data"))
 MAP = DATA / "maps" / "turtlebot3_world.pgm"
 LOGS = {path.name.removesuffix(".log.gz"): path for path in sorted(DATA.glob("logs/*.log.gz"))}
-NOWHERE = -1000.0  # log L where the map knows nothing
 
 
 class Stretch(NamedTuple):
@@ -38,125 +37,52 @@ class Stretch(NamedTuple):
 # --- models -----------------------------------------------------------------------------------
 
 
-class Robot(mpfjax.AbstractStateSpaceModel):
-    """A robot with a map that knows neither its place nor its heading; its motion is the input.
+class GivenDeviations(eqx.Module):
+    """Odometry that comes with its deviations: u_t is (forward, left, turn), (place, turn)."""
 
-    States are (x, y, heading), in metres and radians. x_0 is uniform on free cells and headings.
-    Beams end near an obstacle (Thrun, Burgard and Fox 2005, table 6.3), and the likelihood is to
-    the power of one half, since neighbouring beams are not independent.
-    """
+    noise_dimension = 3
 
-    free: Float[Array, "cells 2"]  # centres
-    known: Bool[Array, "h w"]
-    cell: float
-    distances: Any = None  # (h, w), metres to the nearest obstacle
-    angles: Any = None  # of the beams
-    inputs: Any = None
-    most, deviation, outliers = 8.0, 0.15, 0.1  # metres, and a share of the beams
-    near = 1.0  # metres from the true pose
-
-    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n 3"]:
-        """x_0."""
-        keys = jax.random.split(key, 3)
-        corner = self.free[jax.random.randint(keys[0], (num_particles,), 0, len(self.free))]
-        places = corner + self.cell * (jax.random.uniform(keys[1], (num_particles, 2)) - 0.5)
-        headings = jax.random.uniform(keys[2], (num_particles, 1), minval=-jnp.pi, maxval=jnp.pi)
-        return jnp.concatenate([places, headings], axis=1)
-
-    def log_initial(self, states: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Zero on free cells."""
-        is_free = jnp.zeros(self.known.shape, bool).at[self.cells(self.free)[:2]].set(True)
-        rows, columns, inside = self.cells(states[:, :2])
-        return jnp.where(inside & is_free[rows, columns], 0.0, -jnp.inf)
-
-    def sample_transition(
-        self, key: Key[Array, ""], states: Float[Array, "n 3"]
+    def from_noise(
+        self, noise: Float[Array, "n 3"], poses: Float[Array, "n 3"], odometry: Any
     ) -> Float[Array, "n 3"]:
         """x_t: the motion with noise, in the robot's frame."""
-        motion, (place, turn) = self.inputs
-        noise = jnp.stack([place, place, turn])[None] * jax.random.normal(key, states.shape)
-        forward, left, turned = (motion[None] + noise).T
-        cos, sin = jnp.cos(states[:, 2]), jnp.sin(states[:, 2])
+        motion, (place, turn) = odometry
+        steps = motion[None] + jnp.stack([place, place, turn])[None] * noise
+        forward, left, turned = steps.T
+        cos, sin = jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2])
         moved = jnp.stack([cos * forward - sin * left, sin * forward + cos * left, turned], axis=1)
-        return states + moved
-
-    def cells(self, places: Float[Array, "*n 2"]) -> tuple[Int[Array, "*n"], Int[Array, "*n"], Any]:
-        """Row and column of each place, and whether it is in the map."""
-        height, width = self.known.shape
-        columns, rows = jnp.moveaxis(jnp.floor(places / self.cell).astype(jnp.int32), -1, 0)
-        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-        return jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1), inside
-
-    def log_likelihood(
-        self, observation: Float[Array, " beams"], states: Float[Array, "n 3"]
-    ) -> Float[Array, " n"]:
-        """Of all beams, or next to nothing where the map knows nothing."""
-        rows, columns, inside = self.cells(states[:, :2])
-        is_known = inside & self.known[rows, columns]
-        return jnp.where(is_known, self.log_of_beams(observation, states), NOWHERE)
-
-    def log_density(self, gaps: Array) -> Array:
-        """Of a beam: Gaussian, or uniform up to the longest range."""
-        gaussian = jnp.exp(-0.5 * (gaps / self.deviation) ** 2)
-        gaussian /= self.deviation * np.sqrt(2 * np.pi)
-        return jnp.log((1 - self.outliers) * gaussian + self.outliers / self.most)
-
-    def log_of_beams(self, observation: Array, states: Array) -> Array:
-        """By the distance of each beam's end to the nearest obstacle."""
-        headings = states[:, 2:] + self.angles[None]
-        reach = jnp.minimum(observation, self.most)[None, :, None]
-        along = jnp.stack([jnp.cos(headings), jnp.sin(headings)], axis=-1)
-        rows, columns, inside = self.cells(states[:, None, :2] + reach * along)
-        gaps = jnp.where(inside, self.distances[rows, columns], 1.0)
-        logs = self.log_density(gaps)
-        return 0.5 * jnp.sum(jnp.where((observation < self.most)[None], logs, 0.0), axis=1)
+        return poses + moved
 
 
-class Ranges(Robot):
-    """Beams all around, each with a Gaussian error or with any range at all."""
-
-    table: Any = None  # (h, w, angles), metres to the next wall
-    most: float = 6.0
-    deviation: float = 0.2
-    near, num_beams = 0.6, 8
-    odometry = (0.02, 0.03)  # deviations of a step in metres, and of a turn in radians
-
-    def ranges(self, states: Float[Array, "n 3"]) -> Float[Array, "n beams"]:
-        """Those of a beam without error."""
-        rows, columns, _ = self.cells(states[:, None, :2])
-        turns = states[:, 2:] / (2 * jnp.pi) + jnp.arange(self.num_beams)[None] / self.num_beams
-        num_angles = self.table.shape[2]
-        angles = jnp.round(turns * num_angles).astype(jnp.int32) % num_angles
-        return self.table[rows, columns, angles]
-
-    def log_of_beams(self, observation: Array, states: Array) -> Array:
-        """By the range to the next wall."""
-        gaps = observation[None] - self.ranges(states)
-        return jnp.sum(self.log_density(gaps), axis=1)
-
-
-class Ring(Ranges):
+class Ring(mpfjax.AbstractStateSpaceModel):
     """A corridor that runs round a building, 60 m with a door every 2.5, that look alike.
 
     Either way may be forward, so that there are 48 hypotheses until a door with a niche behind it
-    comes by. What is seen is how much farther the wall is than where there is no door. x is along
-    the corridor, y nothing, and the heading 0 or pi.
+    comes by. What is seen is how much farther the wall is than where there is no door, with a
+    deviation of .1 m, or, one in ten times, anything. x is along the corridor, y nothing, and the
+    heading 0 or pi.
     """
 
-    odometry = (0.05, 0.0)
-    log_initial: Any = None  # its heading is one of two
+    motion: GivenDeviations = GivenDeviations()
+    inputs: Any = None
+
+    noise_dimension, initial_noise_dimension = 3, 2
+    periods = np.array([0.0, 0.0, 2 * np.pi])
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n 3"]:
         """x_0."""
-        place, way = jax.random.uniform(key, (2, num_particles))
-        return jnp.stack([60 * place, 0 * place, jnp.where(way < 0.5, 0.0, jnp.pi)], axis=1)
-
-    initial_noise_dimension = 2
+        return self.initial_from_noise(jax.random.normal(key, (num_particles, 2)))
 
     def initial_from_noise(self, noise: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
         """x_0 of normal numbers."""
         place, way = jax.scipy.special.ndtr(noise).T
         return jnp.stack([60 * place, 0 * place, jnp.where(way < 0.5, 0.0, jnp.pi)], axis=1)
+
+    def transition_from_noise(
+        self, noise: Float[Array, "n 3"], states: Float[Array, "n 3"]
+    ) -> Float[Array, "n 3"]:
+        """x_t."""
+        return self.motion.from_noise(noise, states, self.inputs)
 
     def ranges(self, states: Float[Array, "n 3"]) -> Float[Array, "n 1"]:
         """The doors, and a niche of twice their depth 1 m behind the one at 0."""
@@ -168,93 +94,112 @@ class Ring(Ranges):
     def log_likelihood(
         self, observation: Float[Array, "1"], states: Float[Array, "n 3"]
     ) -> Float[Array, " n"]:
-        """Of the range to the wall, everywhere."""
-        return self.log_of_beams(observation, states)
+        """Of the range to the wall."""
+        gaps = observation - self.ranges(states)[:, 0]
+        return jnp.log(0.9 * jax.scipy.stats.norm.pdf(gaps, 0.0, 0.1) + 0.1)
 
 
-# --- scenes: a model, and four drives of so many steps, or of as many as the scene has ----------
-
-Scene = tuple[Any, list[Stretch]]
+# --- scenes, with four drives of so many steps, or of as many as the scene has ------------------
 
 
-def drives(model: Any, seed: int, path: Callable[[np.random.Generator], np.ndarray]) -> Scene:
+class Scene(NamedTuple):
+    """A model, how near to the true pose a robot is right, in metres, and drives."""
+
+    model: Any
+    near: float
+    drives: list[Stretch]
+
+
+class Errors(NamedTuple):
+    """Of what is simulated, in metres and radians."""
+
+    place: float = 0.02  # deviations of a step
+    turn: float = 0.03
+    range: float = 0.2
+    most: float = 6.0  # of any range, which one in ten beams has
+
+
+def simulated(
+    model: Any,
+    ranges: Callable[[Array], Array],
+    errors: Errors,
+    seed: int,
+    path: Callable[[np.random.Generator], np.ndarray],
+) -> Scene:
     """Noisy odometry and scans along four paths, each from the pose of x_0 on."""
     found = []
     for rng in [np.random.default_rng([seed, number]) for number in range(4)]:
         poses = path(rng)
-        moved, cos, sin = np.diff(poses, axis=0), np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-        forward, left = cos * moved[:, 0] + sin * moved[:, 1], cos * moved[:, 1] - sin * moved[:, 0]
-        deviations = np.tile(model.odometry, (len(moved), 1))
-        motion = np.stack([forward, left, moved[:, 2]], axis=1)
+        motion = robots.odometry_steps(poses)
+        deviations = np.tile([errors.place, errors.turn], (len(motion), 1))
         motion += deviations[:, [0, 0, 1]] * rng.normal(size=motion.shape)
-        true = np.asarray(model.ranges(jnp.asarray(poses[1:], jnp.float32)))
-        seen = true + model.deviation * rng.normal(size=true.shape)
-        anything = rng.uniform(0, model.most, true.shape)
-        seen = np.where(rng.random(true.shape) < model.outliers, anything, seen)
+        true = np.asarray(ranges(jnp.asarray(poses[1:], jnp.float32)))
+        seen = true + errors.range * rng.normal(size=true.shape)
+        anything = rng.uniform(0, errors.most, true.shape)
+        seen = np.where(rng.random(true.shape) < 0.1, anything, seen)
         found.append(Stretch(motion, deviations, poses[1:], seen))
-    return model, found
+    return Scene(model, 0.6, found)
 
 
 def building(name: str, seed: int, steps: int | None) -> Scene:
     """A real building, its map from its log, and stretches of 40 real scans."""
     made = runpy.run_path(str(DATA / "logs" / "building.py"))["Building"](LOGS[name])
     beams = np.linspace(0, len(made.angles) - 1, 24).round().astype(int)
-    model = Robot(
-        jnp.asarray(made.free, jnp.float32), jnp.asarray(made.known), 0.1,
-        distances=jnp.asarray(made.field, jnp.float32),
-        angles=jnp.asarray(made.angles[beams], jnp.float32),
+    sensor = robots.LikelihoodField(
+        made.angles[beams], laser_max_range=8.0, z_hit=0.9, z_rand=0.1, sigma_hit=0.15,
+        laser_likelihood_max_dist=1.0, exponent=0.5,
     )  # fmt: skip
+    grid = robots.OccupancyGrid(made.occ, made.known & ~made.occ, resolution=0.1)
+    model = robots.RobotModel(grid, GivenDeviations(), sensor, clearance=0.25)
     rng, length = np.random.default_rng(seed), steps or 40
     starts = np.linspace(0, len(made.poses) - length - 2, 4).astype(int)
-    return model, [Stretch(*made.series(start, length, rng)) for start in starts]
+    return Scene(model, 1.0, [Stretch(*made.series(start, length, rng)) for start in starts])
 
 
-def with_table(wall: np.ndarray, known: np.ndarray, cell: float, **options: Any) -> Ranges:
-    """The model of a map. It may start where no wall is within .12 m."""
-    field = cell * np.asarray(distance_transform_edt(~wall))
-    rows, columns = np.nonzero(known & (field > 0.12))
-    free = jnp.asarray(cell * (np.stack([columns, rows], axis=1) + 0.5), jnp.float32)
-    model = Ranges(free, jnp.asarray(known), cell, **options)
-    angles = jnp.arange(90.0) * 2 * jnp.pi / 90
-    along = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-    places = cell * (jnp.asarray(np.stack([*np.indices(wall.shape)][::-1], -1)[:, :, None]) + 0.5)
+def drawn(
+    grid: robots.OccupancyGrid,
+    errors: Errors,
+    seed: int,
+    path: Callable[[robots.RobotModel, np.random.Generator], np.ndarray],
+) -> Scene:
+    """A map with eight beams all around; x_0 may be where no wall is within .12 m."""
+    grid = grid.tabulated(90)
+    sensor = robots.BeamModel(
+        2 * np.pi * np.arange(8) / 8, laser_max_range=errors.most, sigma_hit=errors.range,
+        z_hit=0.9, z_rand=0.1, z_short=0.0,
+    )  # fmt: skip
+    model = robots.RobotModel(grid, GivenDeviations(), sensor, clearance=0.12)
 
-    @jax.jit
-    def table(field: Array, reach: Array) -> Array:
-        def advance(_: Any, reach: Array) -> Array:
-            rows, columns, _ = model.cells(places + reach[..., None] * along[None, None])
-            gap = field[rows, columns]
-            step = jnp.where(gap > 0, jnp.maximum(gap - cell, cell / 2), 0)
-            return jnp.minimum(reach + step, model.most)
+    def ranges(poses: Array) -> Array:
+        return grid.ranges(poses, sensor.angles, errors.most)
 
-        return jax.lax.fori_loop(0, int(2 * model.most / cell), advance, reach)
-
-    found = table(jnp.asarray(field, jnp.float32), jnp.zeros((*wall.shape, 90)))
-    return Ranges(free, model.known, cell, table=found, **options)
+    scene = simulated(model, ranges, errors, seed, partial(path, model))
+    # An error of a short range may have another sign, and none is below zero.
+    return scene._replace(drives=[each._replace(seen=abs(each.seen)) for each in scene.drives])
 
 
 def turtlebot(seed: int, steps: int | None) -> Scene:
     """TurtleBot3's world, nearly six-fold symmetric, and random drives of 50 steps."""
-    raw = MAP.read_bytes()
-    head: Any = re.match(rb"P5\s+(?:#.*\n)?(\d+)\s+(\d+)\s+\d+\s", raw)
-    grey = np.frombuffer(raw[head.end() :], np.uint8).reshape(int(head[2]), int(head[1]))
-    rows, columns = np.nonzero((grey < 90) | (grey > 250))
-    grey = grey[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-    model = with_table(grey < 90, grey > 250, 0.05, most=3.5, deviation=0.1)
-    return drives(model, seed, lambda rng: wander(model, steps or 50, rng))
+    grid = robots.read_map(MAP, resolution=0.05, occupied_thresh=0.649, free_thresh=0.018)
+    rows, columns = np.nonzero(grid.free | grid.occupied)
+    part = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    grid = robots.OccupancyGrid(grid.occupied[part], grid.free[part], resolution=0.05)
+    errors = Errors(range=0.1, most=3.5)
+    return drawn(grid, errors, seed, lambda model, rng: wander(model, steps or 50, rng))
 
 
-def wander(model: Ranges, steps: int, rng: np.random.Generator) -> np.ndarray:
+def wander(model: robots.RobotModel, steps: int, rng: np.random.Generator) -> np.ndarray:
     """A random drive of .2 m a step that turns before walls."""
-    free = {(int(x), int(y)) for x, y in np.asarray(model.free) / model.cell}
+    cell, starts = model.grid.resolution, np.asarray(model.starts)
+    free = {(int(x), int(y)) for x, y in starts}
 
     def ahead(pose: np.ndarray, way: float) -> np.ndarray:
         return pose + way * np.array([np.cos(pose[2]), np.sin(pose[2]), 0])
 
     def is_free(pose: np.ndarray) -> bool:
-        return (int(pose[0] / model.cell), int(pose[1] / model.cell)) in free
+        return (int(pose[0] / cell), int(pose[1] / cell)) in free
 
-    pose = np.array([*rng.choice(np.asarray(model.free)), rng.uniform(-np.pi, np.pi)])
+    pose = np.array([*(cell * (rng.choice(starts) + 0.5)), rng.uniform(-np.pi, np.pi)])
     poses = [pose]
     for _ in range(steps):
         for spread in [0.15] * 3 + [2.0] * 60:
@@ -330,17 +275,17 @@ ROOMS = {
 
 def rooms(name: str, seed: int, steps: int | None) -> Scene:
     """Rooms that are equal, but for a pillar that is seen at the end."""
-    wall = ROOMS[name].wall()
+    grid = robots.OccupancyGrid(ROOMS[name].wall(), resolution=0.1)
     way = ROOMS[name].way(steps)
-    return drives(with_table(wall, ~wall, 0.1), seed, lambda _: way)
+    return drawn(grid, Errors(), seed, lambda model, rng: way)
 
 
 def ring(seed: int, steps: int | None) -> Scene:
     """A ring of doors: 48 hypotheses until the end of 40 steps."""
-    model = Ring(jnp.zeros((1, 2)), jnp.zeros((1, 1), bool), 1.0, most=1.0, deviation=0.1)
     along = 62.5 + 0.25 * np.arange(-(steps or 40), 1)
     path = np.stack([along, 0 * along, 0 * along], axis=1)
-    return drives(model, seed, lambda _: path)
+    model, errors = Ring(), Errors(place=0.05, turn=0.0, range=0.1, most=1.0)
+    return simulated(model, model.ranges, errors, seed, lambda rng: path)
 
 
 # By name: those whose data are there, and those that always are.
