@@ -2,18 +2,23 @@
 
     python -m benchmarks.multi_target
 
-Twelve objects in 100 scans, after the linear scene of Vo and Vo: they come to a square of 2 km, and
-move on straight lines, with 60 false plots a scan; new ones appear at known spots, or anywhere.
-OSPA has the cutoff 100 m and the order 1; `number` is the mean of |expected - true number|,
-`switches` those of a run, `ms a scan` the median of the runs after the first, in CPU time.
+Scenes of 60 to 100 scans: twelve objects on straight lines among 60 false plots, after Vo and Vo.
+They come from known spots, or from anywhere, then also such that no two are nearer than 57 m, or
+seen by two radars whose p_D falls with the range. Ten objects turn, in range and bearing; two cross
+or part; four meet (Williams 2015), with the numbers of García-Fernández et al. (2018). Where all is
+linear, `--peers` adds Stone Soup's JPDA with belief propagation, at seconds to minutes a run.
+
+`distance` is OSPA of order 1, and for the four GOSPA of order 2, root of its mean square; `number`
+is the mean of |expected - true number|, `switches` those of a run, `ms a scan` the median of the
+runs after the first, in CPU time.
 
 Into --out DIR go multi_target.json and multi_target.png, the first run of the first scene.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,16 +27,30 @@ import numpy as np
 import mpfjax
 from benchmarks import harness
 from benchmarks.harness import Count, command
-from benchmarks.multi_target.gm_phd import followed
-from benchmarks.multi_target.scenes import SCENES, STEPS, Scene, drawn, model_of, told
+from benchmarks.multi_target import gm_phd, stone_soup
+from benchmarks.multi_target.scenes import PLACE, SCENES, Scene, drawn, model_of, told
 
-CUTOFF = 100.0
 CELLS = {
-    "OSPA": "{ospa:.1f} ± {ospa_error:.1f}",
+    "distance": "{distance:.3g} ± {distance_error:.1g}",
+    "of GM-PHD's": "{share:.2f}",
     "number": "{number:.2f} ± {number_error:.2f}",
     "switches": "{switches:.1f}",
     "ms a scan": "{ms:.1f}",
 }
+OURS, PHD, JPDA = "bernoulli_filter", "GM-PHD", "JPDA"
+
+
+class Found(NamedTuple):
+    """What a filter tells at each step."""
+
+    places: np.ndarray  # (t, m, 2)
+    is_told: np.ndarray  # (t, m)
+    numbers: np.ndarray  # of objects to expect
+    labels: np.ndarray | None = None
+    existence: np.ndarray | None = None
+
+
+Run = Callable[[int, tuple[np.ndarray, ...]], Found]
 
 
 @command(seeds=2, steps=10, particles_per_target=20, scenes=["known spots"])
@@ -39,119 +58,108 @@ def main(
     *,
     scenes: Sequence[Annotated[str, (*SCENES,)]] = (*SCENES,),
     seeds: Count = 20,
-    steps: Count = STEPS,
+    steps: Count = 100,
     particles_per_target: Count = 150,
+    peers: bool = False,
     out: Path = Path("results/multi_target"),
 ) -> None:
     """Scene by scene.
 
-    - `particles_per_target`: of 24 that may exist, or of 112 a third of it where objects appear
-      anywhere.
+    - `particles_per_target`: of 24 that may exist; where objects appear anywhere, a third of it of
+      12 more than a scan has plots.
+    - `peers`: Stone Soup's JPDA too.
     """
-    settings, rows, pictures = harness.settings_of(locals()), [], {}
+    settings, rows, pictures = harness.settings_of(locals()), [], []
     for name in scenes:
         scene = SCENES[name]
         data = [drawn(scene, seed, steps) for seed in range(seeds)]
-        ours, phd = _ours(scene, particles_per_target), _gm_phd(scene)
-        for label, run in (("bernoulli_filter", ours), ("GM-PHD", phd)):
+        filters = {OURS: _ours(scene, particles_per_target), PHD: _of(gm_phd.followed, scene)}
+        if peers and stone_soup.applies(scene):
+            filters[JPDA] = _of(stone_soup.followed, scene)
+        for label, run in filters.items():
             scores = []
-            for seed, (truth, plots) in enumerate(data):
+            for seed, (truth, scans) in enumerate(data):
                 start = time.process_time()
-                found = run(seed, plots)
-                spent = (time.process_time() - start) / steps * 1e3
-                scores.append([*_scores(found, truth), spent])
-                if seed == 0 and label != "GM-PHD":
-                    pictures[name] = (truth, plots, found)
-            ospa, number, switches, ms = np.array(scores).T
-            rows.append(
-                {"scene": name, "filter": label}
-                | dict(zip(("ospa", "ospa_error"), harness.mean_and_error(ospa), strict=True))
-                | dict(zip(("number", "number_error"), harness.mean_and_error(number), strict=True))
-                | {"switches": _or_none(switches.mean()), "ms": _or_none(np.median(ms[1:]))}
-            )
+                found = run(seed, scans)
+                spent = (time.process_time() - start) / len(truth) * 1e3
+                scores.append([*_scores(scene, found, truth), spent])
+                if seed == 0 and label == OURS:
+                    pictures.append((truth, scans[0], found))
+            rows.append({"scene": name, "filter": label} | _means(np.array(scores)))
+        theirs = rows[-len(filters) + 1]["distance"]
+        rows[-len(filters)]["share"] = rows[-len(filters)]["distance"] / theirs
         harness.data(out / "multi_target.json", settings=settings, rows=rows)
+        print(f"\n{harness.table(None, rows)}", flush=True)
     for title, cell in CELLS.items():
-        print(f"\n{harness.pivot(title, rows, '{filter}', '{scene}', cell)}")
-    harness.figures(out, multi_target=_picture(*pictures[next(iter(pictures))]))
+        print(f"\n{harness.pivot(title, rows, '{scene}', '{filter}', cell)}")
+    harness.figures(out, multi_target=_picture(*pictures[0]))
     print(f"written to {out}")
 
 
-def _ours(scene: Scene, each: int) -> Any:
-    """Positions, which of them are told, labels, and the expected number, by seed and plots."""
-    most, undetected = (24, 400) if scene.known else (112, 200)
-    size = undetected + most * (each if scene.known else max(each // 3, 1))
-    filter = mpfjax.bernoulli_filter(model_of(scene), size, most, undetected_particles=undetected)
+def _ours(scene: Scene, each: int) -> Run:
+    anywhere = scene.spots is None
+    most, each = (scene.room + 12, max(each // 3, 1)) if anywhere else (24, each)
+    filter = mpfjax.bernoulli_filter(model_of(scene), 400 + most * each, most)
 
-    def run(seed: int, plots: np.ndarray) -> tuple[np.ndarray, ...]:
-        given = jnp.asarray(plots, jnp.float32)
-        run = mpfjax.run_filter(jax.random.key(seed), filter, given, collect=mpfjax.targets)
-        found = jax.tree.map(np.asarray, run.collected)
-        places = found.means[..., [0, 2]]
-        return places, found.existence > 0.5, found.labels, found.existence.sum(axis=1)
+    def run(seed: int, scans: tuple[np.ndarray, ...]) -> Found:
+        given = tuple(jnp.asarray(plots, jnp.float32) for plots in scans)
+        observations = given if len(given) > 1 else given[0]
+        run = mpfjax.run_filter(jax.random.key(seed), filter, observations, collect=mpfjax.targets)
+        told = jax.tree.map(np.asarray, run.collected)
+        places, existence = told.means[..., PLACE], told.existence
+        return Found(places, existence > 0.5, told.expected_number, told.labels, existence)
 
     return run
 
 
-def _gm_phd(scene: Scene) -> Any:
-    """The same of the rival, whose objects have no labels."""
+def _of(follow: Callable, scene: Scene) -> Run:
+    """The same of a rival, whose objects have no labels."""
 
-    def run(seed: int, plots: np.ndarray) -> tuple[np.ndarray, ...]:
-        places, numbers = zip(*followed(scene, plots), strict=True)
+    def run(seed: int, scans: tuple[np.ndarray, ...]) -> Found:
+        places, numbers = zip(*follow(scene, scans), strict=True)
         most = max(1, *map(len, places))
         padded = np.stack([np.pad(each, ((0, most - len(each)), (0, 0))) for each in places])
         told = np.arange(most) < np.array([len(each) for each in places])[:, None]
-        return padded, told, np.full(told.shape, -1), np.array(numbers)
+        return Found(padded, told, np.array(numbers))
 
     return run
 
 
-def _or_none(value: Any) -> float | None:
-    """A number that JSON has."""
-    return float(value) if np.isfinite(value) else None
-
-
-@jax.jit
-@jax.vmap
-def _ospa(estimates: Any, truths: Any, is_told: Any, is_there: Any) -> Any:
-    return mpfjax.metrics.ospa(
-        estimates, truths, cutoff=CUTOFF, order=1.0, estimate_mask=is_told, truth_mask=is_there
-    )
-
-
-def _scores(found: tuple[np.ndarray, ...], truth: np.ndarray) -> tuple[float, float, float]:
-    """Mean OSPA, mean error of the number, and switches; NaN without labels."""
-    places, is_told, labels, numbers = found
+def _scores(scene: Scene, found: Found, truth: np.ndarray) -> tuple[float, float, float]:
+    """Distance, error of the number, and switches; NaN without labels."""
     there, is_there = told(truth)
-    ospa = np.mean(_ospa(np.float32(places), np.float32(there), is_told, is_there))
-    error = np.mean(np.abs(numbers - is_there.sum(axis=1)))
-    switches = np.nan
-    if (labels >= 0).all():
-        shown = np.where(is_told[..., None], places, np.nan)
+
+    def of_step(places: Any, truths: Any, is_told: Any, is_there: Any) -> Any:
+        given = {"cutoff": scene.cutoff, "estimate_mask": is_told, "truth_mask": is_there}
+        if scene.order == 1:
+            return mpfjax.metrics.ospa(places, truths, order=1.0, **given)
+        return mpfjax.metrics.gospa(places, truths, **given).distance
+
+    places, there = np.float32(found.places), np.float32(there)
+    distances = np.asarray(jax.jit(jax.vmap(of_step))(places, there, found.is_told, is_there))
+    distance = np.mean(distances**scene.order) ** (1 / scene.order)
+    error, switches = np.mean(np.abs(found.numbers - is_there.sum(axis=1))), np.nan
+    if found.labels is not None:
+        shown = np.where(found.is_told[..., None], found.places, np.nan)
         true = np.where(is_there[..., None], there, np.nan)
-        switches = mpfjax.metrics.track_switches(shown, labels, true, cutoff=CUTOFF)
-    return float(ospa), float(error), switches
+        switches = mpfjax.metrics.track_switches(shown, found.labels, true, cutoff=scene.cutoff)
+    return float(distance), float(error), switches
 
 
-def _picture(truth: np.ndarray, plots: np.ndarray, found: tuple[np.ndarray, ...]) -> Any:
+def _means(scores: np.ndarray) -> dict[str, float | None]:
+    """Over the runs, and their standard errors."""
+    distance, number, switches, ms = scores.T
+    row = {"switches": switches.mean(), "ms": np.median(ms[1:])}
+    for name, values in (("distance", distance), ("number", number)):
+        row[name], row[f"{name}_error"] = harness.mean_and_error(values)
+    return {name: float(value) if np.isfinite(value) else None for name, value in row.items()}
+
+
+def _picture(truth: np.ndarray, plots: np.ndarray, found: Found) -> Any:
     """Tracks through the plots, and the number over time."""
     from matplotlib.figure import Figure
 
-    places, is_told, labels, numbers = found
     figure = Figure((10, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    left.plot(*plots.reshape(-1, 2).T, ".", color="0.85", markersize=1, zorder=0)
-    there, is_there = told(truth)
-    for k in range(there.shape[1]):
-        left.plot(*there[is_there[:, k], k].T, color="k", linewidth=0.8)
-    for label in np.unique(labels[is_told]):
-        own = is_told & (labels == label)
-        left.plot(*places[own].T, ".", markersize=3)
-    left.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    steps = np.arange(1, len(truth) + 1)
-    right.step(steps, is_there.sum(axis=1), color="k", where="mid", label="true")
-    right.plot(steps, numbers, label="expected")
-    right.set(xlabel="scan", ylabel="number of objects")
-    right.legend(frameon=False)
     return figure
 
 

@@ -1,72 +1,89 @@
-"""A Gaussian mixture PHD filter (Vo and Ma 2006), of which the other filter is to be better."""
+"""A Gaussian mixture PHD filter (Vo and Ma 2006), extended where motion or sensor is not linear."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from benchmarks.multi_target.scenes import (
-    BIRTHS,
-    HALF_WIDTH,
-    P0,
-    SPOTS,
-    SURVIVAL,
-    A,
-    H,
-    Q,
-    R,
-    Scene,
-)
+from benchmarks.multi_target.scenes import PLACE, SURVIVAL, Scene, Sensor, moved
 
 _LEAST, _NEAR, _MOST = 1e-5, 4.0, 100  # pruned below, merged within, and at most so many
-
-
-def followed(scene: Scene, plots: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
-    """The positions of the objects after each scan, and how many to expect.
-
-    Objects that may appear anywhere are born at the plots of the scan before, with the velocity
-    unknown, as filters with births from measurements have it.
-    """
-    mixture = np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4, 4))
-    born = SPOTS if scene.known else np.zeros((0, 2))
-    for scan in plots:
-        z = scan[~np.isnan(scan[:, 0])]
-        mixture = _merged(*_updated(scene, *mixture, born, z))
-        weights, means, _ = mixture
-        yield np.repeat(means @ H.T, np.round(weights).astype(int), axis=0), float(weights.sum())
-        born = SPOTS if scene.known else z
-
-
 Mixture = tuple[np.ndarray, np.ndarray, np.ndarray]  # weights, means and covariances
 
 
-def _updated(
-    scene: Scene, w: np.ndarray, m: np.ndarray, P: np.ndarray, born: np.ndarray, z: np.ndarray
-) -> Mixture:
+def followed(scene: Scene, scans: tuple[np.ndarray, ...]) -> Iterator[tuple[np.ndarray, float]]:
+    """The positions of the objects after each scan, and how many to expect.
+
+    Objects that may appear anywhere are born at the plots of the scan before, with the velocity
+    unknown, as filters with births from measurements have it. Several sensors correct in turn.
+    """
+    born = _around_spots(scene, scene.rate)
+    w, m, P = _around_spots(scene, scene.first)
+    for plots in zip(*scans, strict=True):
+        seen = [each[~np.isnan(each[:, 0])] for each in plots]
+        F = _slopes(moved, m)
+        P = F @ P @ F.swapaxes(1, 2) + scene.root @ scene.root.T
+        w, m = SURVIVAL * w, moved(m)
+        w, m, P = (np.concatenate(pair) for pair in zip((w, m, P), born, strict=True))
+        for sensor, z in zip(scene.sensors, seen, strict=True):
+            w, m, P = _merged(*_updated(sensor, w, m, P, z))
+        number = np.round(w).astype(int)
+        yield np.repeat(m[:, PLACE], number, axis=0), float(w.sum())
+        if scene.spots is None:
+            born = _at_plots(scene, seen[0])
+
+
+def _around_spots(scene: Scene, number: float) -> Mixture:
+    """So many objects around the spots, if there are any."""
+    size = len(scene.root)
+    spots = np.zeros((0, size)) if scene.spots is None else scene.spots
+    P = np.diag(np.square(scene.deviations))
+    rate = np.full(len(spots), number / max(len(spots), 1))
+    return rate, spots, np.broadcast_to(P, (len(spots), size, size))
+
+
+def _at_plots(scene: Scene, z: np.ndarray) -> Mixture:
+    """New objects at plots of the first sensor."""
+    sensor, places, R = scene.sensors[0], z, np.diag(np.square(scene.sensors[0].deviations))
+    P = np.zeros((len(z), 4, 4)) + np.diag(np.square(scene.deviations))
+    if sensor.origin is not None:
+        r, angle = z.T
+        c, s = np.cos(angle), np.sin(angle)
+        places = np.stack([r * c, r * s], axis=1) + sensor.origin
+        turn = np.stack([np.stack([c, -r * s], 1), np.stack([s, r * c], 1)], axis=1)
+        P[:, 0::2, 0::2] = turn @ R @ turn.swapaxes(1, 2)
+    means = places @ np.eye(4)[PLACE]
+    return np.full(len(z), scene.rate / max(len(z), 1)), means, P
+
+
+def _slopes(function: Callable, x: np.ndarray) -> np.ndarray:
+    """Derivatives of each row's values, by differences."""
+    steps = 1e-4 * np.eye(x.shape[1])
+    return np.stack([(function(x + h) - function(x - h)) / 2e-4 for h in steps], axis=-1)
+
+
+def _updated(sensor: Sensor, w: np.ndarray, m: np.ndarray, P: np.ndarray, z: np.ndarray) -> Mixture:
     """The intensity after a scan: table I of the paper."""
-    density = scene.clutter / (2 * HALF_WIDTH) ** 2
-    rate = np.full(len(born), BIRTHS / max(len(born), 1))
-    w = np.concatenate([SURVIVAL * w, rate])
-    m = np.concatenate([m @ A.T, born @ H])
-    P = np.concatenate([A @ P @ A.T + Q, np.broadcast_to(P0, (len(born), 4, 4))])
-    S = H @ P @ H.T + R
-    gains = P @ H.T @ np.linalg.inv(S)
-    updated = (np.eye(4) - gains @ H) @ P
-    gaps = z[:, None] - m @ H.T
+    d, p = m.shape[1], sensor.detection(m)
+    H = _slopes(lambda x: sensor.seen(x).T, m)
+    S = H @ P @ H.swapaxes(1, 2) + np.diag(np.square(sensor.deviations))
+    gains = P @ H.swapaxes(1, 2) @ np.linalg.inv(S)
+    updated = (np.eye(d) - gains @ H) @ P
+    gaps = np.moveaxis(sensor.gaps(z.T[:, :, None], sensor.seen(m)[:, None]), 0, -1)
     squares = np.einsum("kni,nij,knj->kn", gaps, np.linalg.inv(S), gaps)
     likely = np.exp(-0.5 * squares) / (2 * np.pi * np.sqrt(np.linalg.det(S)))
-    shares = scene.p_d * w * likely
-    shares /= density + shares.sum(axis=1, keepdims=True)
-    moved = m + np.einsum("nij,knj->kni", gains, gaps)
+    shares = p * w * likely
+    shares /= sensor.density + shares.sum(axis=1, keepdims=True)
+    corrected = m + np.einsum("nij,knj->kni", gains, gaps)
     return (
-        np.concatenate([(1 - scene.p_d) * w, shares.ravel()]),
-        np.concatenate([m, moved.reshape(-1, 4)]),
+        np.concatenate([(1 - p) * w, shares.ravel()]),
+        np.concatenate([m, corrected.reshape(-1, d)]),
         np.concatenate([P, np.tile(updated, (len(z), 1, 1))]),
     )
 
 
 def _merged(w: np.ndarray, m: np.ndarray, P: np.ndarray) -> Mixture:
     """Fewer components of the same intensity: table II of the paper."""
-    chosen = w > _LEAST
+    size, chosen = m.shape[1], w > _LEAST
     w, m, P = w[chosen], m[chosen], P[chosen]
     parts = []
     while len(w) and len(parts) < _MOST:
@@ -80,6 +97,6 @@ def _merged(w: np.ndarray, m: np.ndarray, P: np.ndarray) -> Mixture:
         parts.append((total, mean, np.einsum("n,nij->ij", w[near], spread) / total))
         w, m, P = w[~near], m[~near], P[~near]
     if not parts:
-        return np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4, 4))
+        return np.zeros(0), np.zeros((0, size)), np.zeros((0, size, size))
     weights, means, covariances = map(np.array, zip(*parts, strict=True))
     return weights, means, covariances
