@@ -20,7 +20,6 @@ from mpfjax.models.base import per_particle as per_particle
 from mpfjax.models.births import AbstractBirth as AbstractBirth
 from mpfjax.models.births import Box as Box
 from mpfjax.models.births import Disc as Disc
-from mpfjax.models.births import GaussianBirth as GaussianBirth
 from mpfjax.models.births import UniformBirth as UniformBirth
 from mpfjax.models.clutter import ClutteredModel as ClutteredModel
 from mpfjax.models.conditionally_linear import (

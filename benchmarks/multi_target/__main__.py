@@ -69,7 +69,7 @@ def main(
       12 more than a scan has plots.
     - `peers`: Stone Soup's JPDA too.
     """
-    settings, rows, pictures = harness.settings_of(locals()), [], []
+    settings, rows = harness.settings_of(locals()), []
     for name in scenes:
         scene = SCENES[name]
         data = [drawn(scene, seed, steps) for seed in range(seeds)]
@@ -83,8 +83,8 @@ def main(
                 found = run(seed, scans)
                 spent = (time.process_time() - start) / len(truth) * 1e3
                 scores.append([*_scores(scene, found, truth), spent])
-                if seed == 0 and label == OURS:
-                    pictures.append((truth, scans[0], found))
+                if seed == 0 and label == OURS and name == scenes[0]:
+                    harness.figures(out, multi_target=_picture(truth, scans[0], found))
             rows.append({"scene": name, "filter": label} | _means(np.array(scores)))
         theirs = rows[-len(filters) + 1]["distance"]
         rows[-len(filters)]["share"] = rows[-len(filters)]["distance"] / theirs
@@ -92,7 +92,6 @@ def main(
         print(f"\n{harness.table(None, rows)}", flush=True)
     for title, cell in CELLS.items():
         print(f"\n{harness.pivot(title, rows, '{scene}', '{filter}', cell)}")
-    harness.figures(out, multi_target=_picture(*pictures[0]))
     print(f"written to {out}")
 
 
@@ -157,9 +156,31 @@ def _means(scores: np.ndarray) -> dict[str, float | None]:
 
 def _picture(truth: np.ndarray, plots: np.ndarray, found: Found) -> Any:
     """Tracks through the plots, and the number over time."""
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
     figure = Figure((10, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot(*plots.reshape(-1, 2).T, ".", color="0.87", markersize=1, zorder=0)
+    there, is_there = told(truth)
+    for k in range(there.shape[1]):
+        left.plot(*there[is_there[:, k], k].T, color="k", linewidth=0.8)
+    labels, steps = np.unique(found.labels[found.is_told]), np.arange(1, len(truth) + 1)
+    colours = colormaps["turbo"](np.linspace(0, 1, len(labels)))
+    for label, colour in zip(labels, colours, strict=True):
+        own = found.is_told & (found.labels == label)
+        left.plot(*found.places[own].T, ".", color=colour, markersize=3)
+    left.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+
+    shares = np.cumsum(jax.vmap(mpfjax.number_distribution)(found.existence), axis=1)
+    low, high = ((shares < q).sum(axis=1) for q in (0.1, 0.9))
+    right.fill_between(steps, low, high, color="C0", alpha=0.3, linewidth=0, step="mid")
+    right.step(steps, is_there.sum(axis=1), color="k", where="mid")
+    right.plot(steps, found.numbers, color="C0")
+    top = is_there.sum(axis=1).max()
+    right.text(2, top + 0.6, "true", color="k")
+    right.text(2, top, "expected, and 10 to 90%", color="C0")
+    right.set(xlabel="scan", ylabel="number of objects", ylim=(0, top + 1.5))
     return figure
 
 

@@ -12,8 +12,6 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import FINITE, POSITIVE, Fitting, to_array
-from mpfjax.models.gaussians import Gaussian, Linear, cholesky, update
-from mpfjax.models.linear import LinearGaussianModel
 from mpfjax.operations.random import normal, split, uniform
 
 Rate = Annotated[Float[Array, ""], POSITIVE]
@@ -38,38 +36,6 @@ class AbstractBirth(eqx.Module):
     ) -> tuple[PyTree, Float[Array, " n"]] | None:
         """States of new objects that a sensor's measurement may come from, and log b(x) / q(x)."""
         return None
-
-
-class GaussianBirth(AbstractBirth, Fitting):
-    """New objects with x_0 ~ N(m0, P0) of a linear model; near a measurement, x_0 given it.
-
-    Raises `ValueError` for a rate that is not positive. Use it with a wide P0 where objects may
-    appear anywhere.
-    """
-
-    rate: Rate = eqx.field(converter=to_array("rate"))
-    model: LinearGaussianModel
-
-    def sample(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
-        """x_0."""
-        return self.model.sample_initial(key, num_particles)
-
-    def propose(
-        self,
-        key: Key[Array, ""],
-        measurement: Float[Array, " p"],
-        num_particles: int,
-        sensor: int = 0,
-    ) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
-        """x_0 given the measurement, and log of its density over that of x_0 given it."""
-        m = self.model
-        prior = Gaussian(m.m0[:, None], m.P0[:, :, None])
-        seen = Linear(m.H[:, :, None], jnp.zeros((len(m.R), 1)), m.R[:, :, None])
-        found, log_predicted = update(prior, measurement[:, None], seen)
-        root = cholesky(found.covariance)[:, :, 0]
-        noise = normal(key, (num_particles, len(m.m0)), m.m0.dtype)
-        states = found.mean.T + noise @ root.T
-        return states, log_predicted - m.log_likelihood(measurement, states)
 
 
 class Box(Fitting):

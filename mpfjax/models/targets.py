@@ -32,7 +32,7 @@ class TargetsModel(AbstractStateSpaceModel, Fitting):
 
     - `sensors`: a `ClutteredModel`, of one object's motion, one measurement of it, p_D and the
       clutter; or several, used in turn, of which the first has the motion.
-    - `birth`: the new objects of a step, an `AbstractBirth`: `UniformBirth`, `GaussianBirth`.
+    - `birth`: the new objects of a step, a `UniformBirth` or another `AbstractBirth`.
     - `survival_probability`: p_S, a number in [0, 1], or a function of the states, (n,).
     - `initial_number`: how many objects to expect at t = 0, like new ones.
 

@@ -2,6 +2,7 @@
 
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import scipy.stats
 
 import mpfjax
-from mpfjax import ClutteredModel, Filter, GaussianBirth, TargetsModel
+from mpfjax import ClutteredModel, Filter, TargetsModel
 from mpfjax.moves.objects.association import associate
 from mpfjax.moves.objects.bernoulli import TARGETS, Associate
 from mpfjax.moves.propagation.propagate import Predict
@@ -108,9 +109,25 @@ def test_derivatives_of_associations():
     np.testing.assert_allclose(jax.grad(first)(at), slope, rtol=0.1, atol=2e-3)
 
 
+class Birth(mpfjax.AbstractBirth):
+    """x_0 of the object; at a measurement, given it."""
+
+    rate: jax.Array
+
+    def sample(self, key, num_particles):
+        return OBJECT.sample_initial(key, num_particles)
+
+    def propose(self, key, measurement, num_particles, sensor=0):
+        gain = P0 / (P0 + R)
+        noise = jax.random.normal(key, (num_particles, 1))
+        states = gain * measurement[None] + jnp.sqrt(gain * R) * noise
+        predicted = jax.scipy.stats.norm.logpdf(measurement[0], 0.0, jnp.sqrt(P0 + R))
+        return states, predicted - OBJECT.log_likelihood(measurement, states)
+
+
 def model(rate=0.5, **options):
     options = {"survival_probability": 0.95, "initial_number": 0.0} | options
-    return TargetsModel(SENSOR, GaussianBirth(rate, OBJECT), **options)
+    return TargetsModel(SENSOR, Birth(jnp.float32(rate)), **options)
 
 
 def bernoulli_mixture(filter, states, existence):
@@ -201,7 +218,7 @@ def test_a_known_single_object_is_that_of_all_associations():
 
     data, clutter = np.array([[0.4], [0.9], [-0.2], [1.5], [-1.0]]), 1e-6
     sensor = ClutteredModel(OBJECT, 1.0, clutter)
-    certain = TargetsModel(sensor, GaussianBirth(1e-12, OBJECT), 1.0)
+    certain = TargetsModel(sensor, Birth(jnp.float32(1e-12)), 1.0)
     totals, _ = run_all(keys, certain, jnp.asarray(data[:, None], jnp.float32))
     kalman = mpfjax.exact.kalman_filter(OBJECT, jnp.asarray(data, jnp.float32))
     log_z = float(kalman.log_marginal_likelihood) - len(data) * np.log(clutter)
@@ -267,7 +284,7 @@ def test_objects_not_detected_yet_are_those_of_gaussian_sums():
 def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
     """One object that may exist, against the product of the sensors' likelihoods."""
     near = ClutteredModel(OBJECT, lambda states: jnp.where(states[:, 0] < 1, 0.9, 0.0), CLUTTER)
-    targets = TargetsModel((SENSOR, near), GaussianBirth(1e-12, OBJECT), 0.95)
+    targets = TargetsModel((SENSOR, near), Birth(jnp.float32(1e-12)), 0.95)
     filter = Filter(targets, [Associate(particles_per_birth=2, undetected_particles=10)], 110, 3)
     states = np.random.default_rng(0).normal(0.5, 1, (1, 100, 1))
     mixture, r = bernoulli_mixture(filter, states, [0.9]), 0.95 * 0.9
@@ -289,26 +306,34 @@ def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
 
 
 def test_derivatives_of_the_evidence():
-    """Of one scan, whose draws depend on nothing, by p_D and log λ."""
-    scan, targets = jnp.array([[0.2], [1.5], [NAN]]), model(initial_number=1.0)
+    """By p_D, log λ and log R, over scans; against differences, in the mean over keys."""
+    targets = model(0.3, initial_number=1.0)
+    scans = jnp.array([[0.2, 1.5], [0.4, NAN], [0.1, -2.0], [NAN, NAN], [0.3, 2.0]])[..., None]
+    keys = jax.random.split(KEY, 40)
 
-    @jax.jit
-    def log_evidence(p, log_clutter):
-        sensor = ClutteredModel(OBJECT, p, jnp.exp(log_clutter))
+    def log_evidence(at, key):
+        p, log_clutter, log_noise = at
+        moving = eqx.tree_at(lambda m: m.R, OBJECT, jnp.exp(log_noise)[None, None])
+        sensor = ClutteredModel(moving, p, jnp.exp(log_clutter))
         changed = TargetsModel(sensor, targets.birth, 0.95, 1.0)
-        filter = mpfjax.bernoulli_filter(changed, 800, 4, resample=mpfjax.Resample())
-        return mpfjax.run_filter(KEY, filter, scan[None]).log_marginal_likelihood
+        filter = mpfjax.bernoulli_filter(changed, 800, 4)
+        return mpfjax.run_filter(key, filter, scans).log_marginal_likelihood
 
-    at, step = (jnp.float32(0.7), jnp.float32(-1.0)), 0.01
-    slopes = jax.grad(log_evidence, argnums=(0, 1))(*at)
+    over_keys = jax.jit(jax.vmap(jax.value_and_grad(log_evidence), in_axes=(None, 0)))
+    at, step = (jnp.float32(P_D), jnp.float32(-1.0), jnp.log(jnp.float32(R))), 0.1
+    slopes = over_keys(at, keys)[1]
     for k, slope in enumerate(slopes):
-        ends = [log_evidence(*(v + s * step * (j == k) for j, v in enumerate(at))) for s in (-1, 1)]
-        np.testing.assert_allclose(slope, (ends[1] - ends[0]) / (2 * step), rtol=0.02, atol=0.02)
+        ends = [tuple(v + s * step * (j == k) for j, v in enumerate(at)) for s in (-1, 1)]
+        values = [over_keys(end, keys)[0] for end in ends]
+        differences = np.asarray(values[1] - values[0]) / (2 * step)
+        error = np.hypot(np.std(slope), differences.std()) / np.sqrt(len(keys))
+        assert error < 0.1
+        assert abs(np.mean(slope) - differences.mean()) < 4 * error + 0.03
 
 
 def test_objects_without_room_are_told_and_the_table_has_the_rest():
     sensor = ClutteredModel(OBJECT, 0.9, 1e-4)
-    crowd = TargetsModel(sensor, GaussianBirth(2.0, OBJECT), 0.95)
+    crowd = TargetsModel(sensor, Birth(jnp.float32(2.0)), 0.95)
     scans = jnp.tile(jnp.array([[-2.0], [0.0], [2.0]]), (3, 1, 1))
     run = mpfjax.run_filter(
         KEY, mpfjax.bernoulli_filter(crowd, 900, 2), scans, collect=mpfjax.targets

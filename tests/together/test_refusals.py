@@ -119,7 +119,6 @@ GOOD = {
     mpfjax.ClutteredModel: SENSOR,
     mpfjax.TargetsModel: TARGETS,
     mpfjax.UniformBirth: BIRTH,
-    mpfjax.GaussianBirth: {"rate": 1.0, "model": mpfjax.LinearGaussianModel(**LINEAR)},
     mpfjax.Box: {"low": [0.0], "high": [1.0]},
     mpfjax.Disc: {"centre": [0.0], "radius": 1.0},
     mpfjax.Associate: {"particles_per_birth": 2},

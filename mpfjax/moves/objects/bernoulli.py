@@ -79,7 +79,7 @@ class Associate(AbstractWrapper):
     - `undetected_particles`: those of component 0, which fill the first slots.
     - `least_existence`: an object less probable than this has no component of its own.
     - `resample`: how each object is drawn anew, with the particles that its weight earns.
-    - `resample_undetected`: the same for component 0.
+    - `resample_undetected`: the same for component 0; by default its derivative is unbiased.
 
     Raises `ValueError` on islands, for `slots`, and without slots for the objects.
     """
@@ -88,7 +88,9 @@ class Associate(AbstractWrapper):
     undetected_particles: Count = eqx.field(static=True, default=400, kw_only=True)
     least_existence: Share = eqx.field(static=True, default=1e-4, kw_only=True)
     resample: AbstractResampling = eqx.field(default=Resample(), kw_only=True)
-    resample_undetected: AbstractResampling = eqx.field(default=Resample(), kw_only=True)
+    resample_undetected: AbstractResampling = eqx.field(
+        default=Resample(gradient="stop"), kw_only=True
+    )
 
     holds = ("resample", "resample_undetected")
     approximate = True
