@@ -46,8 +46,8 @@ class Found(NamedTuple):
     places: np.ndarray  # (t, m, 2)
     is_told: np.ndarray  # (t, m)
     numbers: np.ndarray  # of objects to expect
-    labels: np.ndarray | None = None
-    existence: np.ndarray | None = None
+    labels: np.ndarray = np.zeros(0)  # none of a rival
+    existence: np.ndarray = np.zeros(0)
 
 
 Run = Callable[[int, tuple[np.ndarray, ...]], Found]
@@ -138,7 +138,7 @@ def _scores(scene: Scene, found: Found, truth: np.ndarray) -> tuple[float, float
     distances = np.asarray(jax.jit(jax.vmap(of_step))(places, there, found.is_told, is_there))
     distance = np.mean(distances**scene.order) ** (1 / scene.order)
     error, switches = np.mean(np.abs(found.numbers - is_there.sum(axis=1))), np.nan
-    if found.labels is not None:
+    if found.labels.size:
         shown = np.where(found.is_told[..., None], found.places, np.nan)
         true = np.where(is_there[..., None], there, np.nan)
         switches = mpfjax.metrics.track_switches(shown, found.labels, true, cutoff=scene.cutoff)
