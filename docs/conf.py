@@ -26,7 +26,7 @@ nitpick_ignore_regex = [
     # What public classes hold or pass on, and users neither make nor read.
     ("py:class", r"mpfjax\..*\._\w+"),
     ("py:class", r"mpfjax\.tuning\.(chains|problem|densities)\.\w+"),
-    ("py:class", r"mpfjax\.(moves\.conditional|running\.long_runs)\.\w+"),
+    ("py:class", r"mpfjax\.(moves\.conditional|running\.(late|long_runs))\.\w+"),
     ("py:class", r"mpfjax\.moves\.resampling\.(line|ancestors)\.\w+"),
     ("py:class", r"mpfjax\.vision\.colour\.(bins|histograms)\.\w+"),
     ("py:class", r"mpfjax\.vision\.tracking\.(camera|gaussian|lives|noise|scores)\.\w+"),
