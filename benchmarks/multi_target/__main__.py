@@ -101,8 +101,8 @@ def _ours(scene: Scene, each: int) -> Run:
     filter = mpfjax.bernoulli_filter(model_of(scene), 400 + most * each, most)
 
     def run(seed: int, scans: tuple[np.ndarray, ...]) -> Found:
-        given = tuple(jnp.asarray(plots, jnp.float32) for plots in scans)
-        observations = given if len(given) > 1 else given[0]
+        given = [jnp.asarray(plots, jnp.float32) for plots in scans]
+        observations = tuple(given) if len(given) > 1 else given[0]
         run = mpfjax.run_filter(jax.random.key(seed), filter, observations, collect=mpfjax.targets)
         told = jax.tree.map(np.asarray, run.collected)
         places, existence = told.means[..., PLACE], told.existence
@@ -172,7 +172,7 @@ def _picture(truth: np.ndarray, plots: np.ndarray, found: Found) -> Any:
         left.plot(*found.places[own].T, ".", color=colour, markersize=3)
     left.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
 
-    shares = np.cumsum(jax.vmap(mpfjax.number_distribution)(found.existence), axis=1)
+    shares = np.cumsum(jax.vmap(mpfjax.number_distribution)(jnp.asarray(found.existence)), axis=1)
     low, high = ((shares < q).sum(axis=1) for q in (0.1, 0.9))
     right.fill_between(steps, low, high, color="C0", alpha=0.3, linewidth=0, step="mid")
     right.step(steps, is_there.sum(axis=1), color="k", where="mid")
