@@ -43,8 +43,9 @@ PILOT = 1 / 5
 # The part of the pilot that stays effective from one power to the next, and the most powers of one
 # observation, of which the last is 1 in any case.
 LEAST_PART, MOST_POWERS = 0.8, 64
-# Moves after each power of y_t, over t: the first ones are cheap.
-MOVES = (12, 8, 6, 3, 2, 1)
+# After each power of y_t x_0 is moved until so many moves over t have been accepted of each path of
+# the pilot, or there were the most: a move costs t steps.
+MOVED, MOST_MOVES = 2.0, 16
 # Shares of the moves: of noise, of walks, and of differences of any two of the pilot, the others
 # being differences of neighbours.
 OF_NOISE, OF_WALKS, OF_JUMPS = 0.15, 0.25, 0.45
@@ -116,7 +117,7 @@ def observe(
     paths, number = _advanced(model, window, paths, t - 1), paths.noise.shape[0]
     is_pilot = jnp.arange(number) >= n
     targets = jnp.array([n, number - n], jnp.int32)
-    num_moves = jnp.array(MOVES)[jnp.minimum(t, len(MOVES)) - 1]
+    enough = jnp.ceil(MOVED * (number - n) / t.astype(default_float())).astype(jnp.int32)
     num_words = 5 + 2 * flatten_states(paths.places).shape[1] + _noise_size(model, paths.states)
     d = flatten_states(paths.places).shape[1]
 
@@ -141,44 +142,30 @@ def observe(
         paths = resampled(key_drawn, paths, log_weights)
         pilot = flatten_states(paths.places)[n:]
 
-        def move(i: Int[Array, ""], paths: Paths) -> Paths:
+        def move(carry: tuple) -> tuple:
+            i, num_moved, paths = carry
             words = bits(jax.random.fold_in(key_moves, i), (num_words, number))
             s = (words[0, 0] % t.astype(jnp.uint32)).astype(jnp.int32)
-            places, noise = _proposed(words[1:], model, paths, s, pilot)
+            places, noise, moves_noise = _proposed(words[1:], model, paths, s, pilot)
             new = _followed(model, window, places, noise, t)
             log_ratio = _log_target(model, new, after) - _log_target(model, paths, after)
-            chance = uniform_of(words[1], log_ratio.dtype)
-            return select_rows(jnp.log(chance) < log_ratio, new, paths)
+            accepted = jnp.log(uniform_of(words[1], log_ratio.dtype)) < log_ratio
+            num_moved += jnp.sum((accepted & ~moves_noise)[n:], dtype=jnp.int32)
+            return i + 1, num_moved, select_rows(accepted, new, paths)
 
-        # Where y_t is no surprise at all, the draws are as good as new ones.
-        is_one_power = (power == 0) & (after == 1)
-        paths = jax.lax.fori_loop(0, jnp.where(is_one_power, 0, num_moves), move, paths)
+        def is_more(carry: tuple) -> Bool[Array, ""]:
+            i, num_moved, _ = carry
+            # Where y_t is no surprise at all, the draws are as good as new ones.
+            return (num_moved < enough) & (i < MOST_MOVES) & ((power > 0) | (after < 1))
+
+        zero = jnp.zeros((), jnp.int32)
+        _, _, paths = jax.lax.while_loop(is_more, move, (zero, zero, paths))
         return key, paths, after, log_mean, count + 1
 
     zero = jnp.zeros((), default_float())
     first = key, paths, zero, zero, jnp.ones((), jnp.int32)
     _, paths, _, log_mean, _ = jax.lax.while_loop(lambda carry: carry[2] < 1, stage, first)
     return paths, log_mean
-
-
-def window_start(
-    key: Key[Array, ""], model: Any, window: Window, num_particles: int
-) -> tuple[Paths, Float[Array, " steps"]]:
-    """N paths that represent p(x_0..x_L | y_1..y_L), and log p(y_t | y_1..y_{t-1}) of each step.
-
-    `paths.states` are x_L, equally weighted; Ẑ is unbiased. The model has `log_initial`, or x_0 is
-    made of noise. Use it where the prior is wide beside few observations together.
-    """
-    num_steps = window.present.shape[0]
-    key_first, key_steps = split(key, 2)
-
-    def advance(paths: Paths, step: tuple) -> tuple[Paths, Float[Array, ""]]:
-        return observe(step[0], model, window, paths, step[1], num_particles)
-
-    paths = first_paths(key_first, model, num_particles, num_steps)
-    steps = jax.random.split(key_steps, num_steps), jnp.arange(1, num_steps + 1)
-    paths, log_means = jax.lax.scan(advance, paths, steps)
-    return jax.tree.map(lambda leaf: leaf[:num_particles], paths), log_means
 
 
 def with_derivatives(
@@ -276,8 +263,8 @@ def _growth(log_last: Float[Array, " p"], rest: Float[Array, ""]) -> Float[Array
 
 def _proposed(
     words: UInt32[Array, "w n"], model: Any, paths: Paths, s: Int[Array, ""], pilot: Array
-) -> tuple[PyTree, Array]:
-    """Other x_0 with the same noise, or the same with other noise of step s.
+) -> tuple[PyTree, Array, Bool[Array, " n"]]:
+    """Other x_0 with the same noise, or the same with other noise of step s, and which it is.
 
     Steps of x_0 are walks of many sizes, in each coordinate another, and differences of two of the
     pilot, which are in order along a curve: those of neighbours fit a mode, and those of any two
@@ -302,4 +289,4 @@ def _proposed(
     if _is_of_noise(model):
         anew = KEPT_NOISE * now + np.sqrt(1 - KEPT_NOISE**2) * anew
     now = select_rows(moves_noise, anew, now)
-    return places, jax.lax.dynamic_update_index_in_dim(paths.noise, now, s, 1)
+    return places, jax.lax.dynamic_update_index_in_dim(paths.noise, now, s, 1), moves_noise

@@ -8,7 +8,13 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.start.window import Window, check_start, window_start, with_derivatives
+from mpfjax.moves.start.window import (
+    Window,
+    check_start,
+    first_paths,
+    observe,
+    with_derivatives,
+)
 from tests.unbiased import assert_unbiased
 
 KEY = jax.random.key(0)
@@ -18,6 +24,20 @@ def window_of(observations, present=None):
     observations = jnp.asarray(observations, jnp.float32)
     present = np.ones(len(observations), bool) if present is None else present
     return Window(observations, None, jnp.asarray(present))
+
+
+def window_start(key, model, window, num_particles):
+    """N paths given the whole window, and log p(y_t | y_1..y_{t-1}) of each step."""
+    num_steps = window.present.shape[0]
+    key_first, key_steps = jax.random.split(key)
+
+    def advance(paths, step):
+        return observe(step[0], model, window, paths, step[1], num_particles)
+
+    steps = jax.random.split(key_steps, num_steps), jnp.arange(1, num_steps + 1)
+    paths = first_paths(key_first, model, num_particles, num_steps)
+    paths, log_means = jax.lax.scan(advance, paths, steps)
+    return jax.tree.map(lambda leaf: leaf[:num_particles], paths), log_means
 
 
 def starts(model, window, num_particles, num_runs, key=KEY):
