@@ -76,7 +76,6 @@ from mpfjax.moves.regrouping.split import Split as Split
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample as AuxiliaryResample
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves.resampling.resample import Resample as Resample
-from mpfjax.moves.restarts import RegroupOthers as RegroupOthers
 from mpfjax.operations.compiling import keep_programs as keep_programs
 from mpfjax.operations.random import normal as normal
 from mpfjax.report import StepInfo as StepInfo

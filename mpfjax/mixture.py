@@ -123,10 +123,7 @@ class ParticleMixture(eqx.Module):
 
     @property
     def began_anew(self) -> Bool[Array, " n"]:
-        """Which slots hold a state that began anew in this step, by `with_restarts`.
-
-        The state before then says nothing of it: it is distributed as the mixture before.
-        """
+        """Which slots hold a state that began anew some steps before, by `with_restarts`."""
         is_orphan = self.ancestor_indices < 0
         # Where none has an ancestor, they were drawn from several, or from a density.
         return is_orphan & ~jnp.all(is_orphan)

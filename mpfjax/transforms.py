@@ -22,8 +22,8 @@ from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.moves.restarts import RegroupOthers, Restart, WatchStart
 from mpfjax.moves.start.start import Begin, Start
+from mpfjax.moves.start.watch import WatchStart
 
 
 @checked
@@ -142,7 +142,7 @@ def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
     very wide, `with_start`.
     """
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
-    if num_draws > 1 and _has(filter, Start):
+    if num_draws > 1 and _begins(filter):
         raise ValueError("filter: its x_0 is chosen by more observations than y_1, by with_start")
     if num_draws == 1:
         return filter.replace(initial_moves=others)
@@ -154,24 +154,63 @@ def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
 def with_start(filter: Filter, num_observations: Count = 8) -> Filter:
     """The filter that begins by a tempered sampler on its first L observations.
 
-    In these steps it costs as much as some 750 others where the prior is wide, little where it is
-    not; Ẑ stays unbiased, and derivatives in these steps are the score. It takes the place of a
-    choice of x_0 by y_1 alone. Online, give y_1 to `filter.init` as well as to the first step.
-    Raises `ValueError` for a model without `log_initial`, a density in all numbers of the state,
-    whose x_0 is not made of noise either. Use it where the prior is very wide, as of a pose in a
-    building: few draws of x_0 are near a mode then, and chance decides its mass. Restarts come
-    after these steps. `num_observations` is L: as many as tell the modes.
+    In these steps it costs as much as some 2000 of a plain filter where the prior is wide, little
+    where it is not; Ẑ stays unbiased, and derivatives in these steps are the score. It takes the
+    place of a choice of x_0 by y_1 alone. Online, give y_1 to `filter.init` as well as to the first
+    step. Raises `ValueError` for a model without `log_initial`, a density in all numbers of the
+    state, whose x_0 is not made of noise either. Use it where the prior is very wide, as of a pose
+    in a building: few draws of x_0 are near a mode then, and chance decides its mass.
+    `num_observations` is L: as many as tell the modes, also of restarts.
     """
-    if _has(filter, Start):
+    if _begins(filter):
         raise ValueError("filter: it has a start by its first observations already")
-    grouping = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
-    if not all(map(_regroups, grouping)):
-        raise ValueError("filter: its initial moves do more than regroup, and a start replaces x_0")
-    last = 1 + max(t for t, move in enumerate(filter.moves) if not _regroups(move))
-    start = Start(filter.moves[:last], grouping, num_observations)
-    return filter.replace(
-        moves=[start, *filter.moves[last:]], initial_moves=[*grouping, Begin(num_observations)]
-    )
+    return _with_window(filter, num_observations, at_first=True)
+
+
+@checked
+def with_restarts(
+    filter: Filter, *, probability: InnerShare = 1e-3, num_observations: Count = 8
+) -> Filter:
+    """The filter that finds a state again which begins anew: a start where the alarm rings.
+
+    The alarm is that of `with_alarm`, of N draws if there is none yet. Where it has risen for L
+    steps or more, a start on the last L observations is joined to the hypotheses by its evidence
+    and p. That step costs as much as a start. A state that begins anew is found L steps later at
+    the earliest. See `Start` for what Ẑ is unbiased for. Of a filter with restarts or a start it
+    changes the settings. Raises `ValueError` for a model that `with_start` refuses. Use it where
+    all hypotheses may be wrong for good: a robot that is carried away, a lost target.
+
+    - `probability`: p, that of having begun anew L steps ago, where the alarm rings.
+    - `num_observations`: L: as many as tell the modes, also of a start.
+    """
+    if not any(isinstance(move, WatchStart) for move in all_of(filter.moves)):
+        filter = with_alarm(filter, filter.num_particles)
+    return _with_window(filter, num_observations, _begins(filter), probability=probability)
+
+
+def _begins(filter: Filter) -> bool:
+    """Whether it has a start by its first observations."""
+    return any(isinstance(move, Begin) and move.at_first for move in filter.initial_moves)
+
+
+def _with_window(filter: Filter, num_observations: int, at_first: bool, **settings: Any) -> Filter:
+    """The filter whose `Start` has these settings, and begins `at_first`."""
+    settings |= {"num_observations": num_observations}
+    initial: list[Any] = [move for move in filter.initial_moves if not isinstance(move, Begin)]
+    if at_first:
+        initial = [move for move in initial if not isinstance(move, SelectInitial)]
+        if not all(map(_regroups, initial)):
+            what = "its initial moves do more than regroup, and a start replaces x_0"
+            raise ValueError(f"filter: {what}")
+    first, *others = filter.moves
+    if isinstance(first, Start):
+        first = dataclasses.replace(first, **settings)
+    else:
+        last = 1 + max(t for t, move in enumerate(filter.moves) if not _regroups(move))
+        grouping = [move for move in initial if _regroups(move)]
+        first, others = Start(filter.moves[:last], grouping, **settings), filter.moves[last:]
+    initial.append(Begin(num_observations, at_first))
+    return filter.replace(moves=[first, *others], initial_moves=initial)
 
 
 def _regroups(move: AbstractMove) -> bool:
@@ -182,69 +221,13 @@ def _regroups(move: AbstractMove) -> bool:
 
 
 @checked
-def with_restarts(
-    filter: Filter,
-    *,
-    probability: InnerShare = 1e-3,
-    share: InnerShare = 1 / 4,
-    num_draws: Count = 4,
-) -> Filter:
-    """The filter that finds a state again which begins anew with a small probability.
-
-    At each step x_{t-1} ~ (1 - p) δ + p p_0, and Ẑ is unbiased for this kernel. Draws of x_0 have a
-    component of their own, one more than the filter has, which its regrouping leaves alone. They
-    are an alarm as well, in the place of that of `with_alarm`. Of a filter with restarts it changes
-    the settings.
-
-    - `probability`: p, that of beginning anew in one step.
-    - `share`: the most of the particles that are draws of x_0, in steps where y_t speaks against
-      all others; elsewhere a sixteenth of it are.
-    - `num_draws`: among how many draws of x_0 y_t chooses each of them.
-
-    Raises `ValueError` for a filter that does not resample all components at each step by a
-    `Resample`. Use it where a hypothesis may be wrong for good: a robot that is carried away, a
-    lost target.
-    """
-    _require_resample(filter, "with which a state begins anew")
-    settings = {"probability": probability, "share": share, "num_draws": num_draws}
-
-    def restarting(move: Any) -> Any:
-        if isinstance(move, Start):
-            return move.map_inner(restarting)
-        is_own = isinstance(move, Resample | AuxiliaryResample)
-        return Restart(move, **settings) if is_own else _apart(move)
-
-    if _has(filter, Restart):
-        return _map_kind(filter, Restart, lambda move: dataclasses.replace(move, **settings))
-    return filter.replace(
-        moves=[restarting(move) for move in filter.moves if not isinstance(move, WatchStart)],
-        initial_moves=[_apart(move) for move in filter.initial_moves],
-        num_components=filter.num_components + 1,
-    )
-
-
-def _has(filter: Filter, kind: type) -> bool:
-    return any(isinstance(move, kind) for move in all_of(filter.moves))
-
-
-def _apart(move: Any) -> Any:
-    """The move with its regroupings kept from the component of restarts."""
-    if isinstance(move, AbstractRegrouping):
-        return RegroupOthers(move)
-    return move.map_inner(_apart)
-
-
-@checked
 def with_alarm(filter: Filter, num_particles: Count = 4096) -> Filter:
     """The filter that says when all its hypotheses seem wrong: `FilterRun.surprised`.
 
     At each step the increment is compared with the evidence for a state that begins anew:
-    `num_particles` draws of x_0, the same at each step, cost as much as so many particles. A
-    filter of `with_restarts` has the same evidence from its own draws, and stays as it is. Use it
+    `num_particles` draws of x_0, the same at each step, cost as much as so many particles. Use it
     where a lost target must be noticed.
     """
-    if _has(filter, Restart):
-        return filter
     others = [move for move in filter.moves if not isinstance(move, WatchStart)]
     return filter.replace(moves=[*others, WatchStart(num_particles)])
 

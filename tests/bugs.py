@@ -141,7 +141,7 @@ BUGS = {
         "mixture.py",
         "log_share = (other.log_scale - log_scale) - math.log(num_islands())",
         "log_share = jnp.zeros_like(log_scale)",
-        "tests/moves/test_restarts.py -k kernel",
+        "tests/moves/test_restarts.py -k evidence_and",
     ),
     "a twisted draw's density lacks its volume": Bug(
         "lookahead/quadratics.py",

@@ -310,7 +310,7 @@ def test_mixtures_know_the_periods_of_their_model(tmp_path):
     def mean(mixture):
         return mixture.mean()
 
-    filters = plain, mpfjax.particle_filter(Heading(), 60), mpfjax.with_restarts(plain)
+    filters = plain, mpfjax.particle_filter(Heading(), 60)
     runs = [mpfjax.run_filter(KEY, each, series, mean) for each in filters]
     runs.append(mpfjax.run_islands(KEY, plain, series, mean, num_islands=2))
     for run in runs:

@@ -3,6 +3,7 @@
 import inspect
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -111,10 +112,10 @@ def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> P
     if first.present is None:
         mixture = given._init(key, first.observations)
     else:
+        chosen = partial(given._init, key, first.observations)
+        # Room for observations is there in any case.
         mixture = jax.lax.cond(
-            first.present,
-            lambda: given._init(key, first.observations),
-            lambda: given._init(key),
+            first.present, chosen, lambda: given._init(key).replace(memory=chosen().memory)
         )
     return mixture.replace(log_scale=mixture.log_scale - log_islands)
 

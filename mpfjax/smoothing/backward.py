@@ -2,8 +2,6 @@
 
 The index of x_s given x_{s+1} has the probabilities W_s^i D(x_{s+1} | x_s^i), where W_s are the
 joint weights of the mixture at s. Component indicators do not enter, since the weights are joint.
-Where the state began anew at s + 1 (`with_restarts`), x_{s+1} says nothing of x_s, and the
-probabilities are W_s^i: so it is exact for the pair of the state and whether it began anew.
 """
 
 import math
@@ -77,20 +75,13 @@ def ended(rows: PyTree, row: PyTree) -> PyTree:
     return jax.tree.map(lambda before, end: jnp.concatenate([before, end[None]]), rows, row)
 
 
-def log_kernel_from(
-    model: Any, mixture: ParticleMixture
-) -> Callable[[tuple[PyTree, Bool[Array, ""]]], Array]:
-    """log of the kernel from every particle, (n,), as a function of a state and if it began anew.
-
-    It is log D(state | x^i), or zero for all i where the state began anew.
-    """
+def log_kernel_from(model: Any, mixture: ParticleMixture) -> Callable[[PyTree], Array]:
+    """log D(state | x^i) of every particle, (n,), as a function of a state."""
     n = mixture.num_particles
 
-    def log_density(future: tuple[PyTree, Bool[Array, ""]]) -> Float[Array, " n"]:
-        state, began_anew = future
+    def log_density(state: PyTree) -> Float[Array, " n"]:
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), state)
-        values = log_transition(model, copies, mixture.particles)
-        return jnp.where(began_anew, jnp.zeros_like(values), values)
+        return log_transition(model, copies, mixture.particles)
 
     return log_density
 

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.checks import checked
 from mpfjax.mixture import ParticleMixture
@@ -13,11 +13,14 @@ from mpfjax.models.observations import refused_where
 from mpfjax.operations.stored import count_places, take
 from mpfjax.running.scan import FilterRun
 
+NO_PAST = "a state that began anew steps before, as with restarts, has no past among the particles"
+
 
 def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     """The stacked mixtures of a run; with those of a whole `FilterRun` x_0 comes first.
 
-    Raises `ValueError` for anything but a stack of mixtures, and for a stack of several runs.
+    Raises `ValueError` for anything but a stack of mixtures, for a stack of several runs, and where
+    states began anew (RuntimeError within jit).
     """
     is_run = isinstance(run, FilterRun)
     mixtures: Any = run.collected if is_run else run
@@ -25,6 +28,9 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
         raise ValueError("mixtures: these are not all of one run; keep them by collect=None")
     # Smoothing does not use the moves' memory, whose leaves may not stack.
     mixtures = jax.vmap(lambda mixture: mixture.replace(memory={}))(mixtures)
+    began_anew = jax.vmap(lambda mixture: mixture.began_anew)(mixtures)
+    began_anew &= mixtures.log_weights > -jnp.inf
+    mixtures = refused_where(jnp.any(began_anew), mixtures, f"mixtures: {NO_PAST}")
     if not is_run:
         return mixtures
     initial = run.initial.replace(memory={})
@@ -33,11 +39,6 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
         initial,
         mixtures,
     )
-
-
-def starts_of(mixtures: ParticleMixture) -> Bool[Array, "t n"]:
-    """Which particles began anew, at every time."""
-    return jax.vmap(lambda mixture: mixture.began_anew)(mixtures)
 
 
 def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:

@@ -34,13 +34,11 @@ from mpfjax.models.gaussians import (
     transposed,
     without_missing,
 )
-from mpfjax.models.observations import refused_where
 from mpfjax.models.steps import log_transition
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
 from mpfjax.smoothing.backward import draw_ends, draw_exactly, ended
-from mpfjax.smoothing.history import starts_of
 
 
 class Information(NamedTuple):
@@ -53,16 +51,14 @@ class Information(NamedTuple):
 
 def check_marginalised(
     model: Any, mixtures: ParticleMixture, observations: Any, method: str
-) -> ParticleMixture:
-    """The mixtures; a `ValueError` for restarts, and for data that backward sampling cannot use."""
+) -> None:
+    """Raise a `ValueError` for data that backward sampling cannot use."""
     if not linear.is_marginalised(model) or observations is None or method != "exact":
         raise ValueError("observations, method: y is for conditionally linear models, by 'exact'")
     lengths = {jnp.shape(leaf)[0] for leaf in jax.tree.leaves(observations)}
     num_steps = mixtures.log_weights.shape[0] - 1
     if lengths != {num_steps}:
         raise ValueError(f"observations: {sorted(lengths)} steps, not {num_steps}, from x_0 on")
-    message = "mixtures: a state that began anew, as with restarts, has moments of its own"
-    return refused_where(jnp.any(starts_of(mixtures)), mixtures, message)
 
 
 @jit_on_wide_vectors

@@ -23,6 +23,7 @@ from mpfjax.operations.stored import take
 from mpfjax.report import StepInfo
 from mpfjax.running.scan import FilterRun, first_mixture, report_of, run_of, sound, step_or_predict
 from mpfjax.smoothing.backward import draw, draw_exactly, log_kernel_from, walk
+from mpfjax.smoothing.history import NO_PAST
 
 
 class SmoothedSums(eqx.Module):
@@ -60,8 +61,8 @@ def smoothed_sums(
     trajectories that end in it. Some particles J of step t - 1 are drawn by the backward kernel,
     W_{t-1}^J D(x_t^i | x_{t-1}^J), and τ_t^i is the mean of τ_{t-1}^J + h(x_{t-1}^J, x_t^i) over
     them. The estimate is Σ_i W_t^i τ_t^i. W are joint weights, so this holds for a mixture too: a
-    particle may come from another component, and with restarts from anywhere. Times Ẑ, it is
-    unbiased if Ẑ is. The filter's run is that of `run_filter` with the same key.
+    particle may come from another component. Times Ẑ, it is unbiased if Ẑ is. The filter's run is
+    that of `run_filter` with the same key; where a state begins anew, by restarts, it is an error.
 
     - `function`: h. It takes x_{t-1} and x_t of n particles, leaves (n, ...), and returns values of
       each, leaves (n, ...); of one particle if the model is wrapped by `per_particle`.
@@ -253,11 +254,11 @@ class FixedLagSmoother(Checked):
         Leaves of the first are (any, n, ...) as they were, of the second (n, ...).
         """
         model, num_draws = with_inputs(self.filter.model, inputs), self.num_draws
-        needed, start = moved.occupied, moved.ancestor_indices
+        anew = jnp.any(moved.began_anew & moved.occupied)
+        needed, start = eqx.error_if((moved.occupied, moved.ancestor_indices), anew, NO_PAST)
         if self.method == "exact":
             log_kernel = log_kernel_from(model, mixture)
-            futures = moved.particles, moved.began_anew
-            indices = draw_exactly(key, log_kernel, futures, mixture, num_draws, needed)
+            indices = draw_exactly(key, log_kernel, moved.particles, mixture, num_draws, needed)
         else:
             key_proposed, key_walk = split(key, 2)
             # The start counts as a draw, unless it would be the only one.

@@ -18,7 +18,7 @@ from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing.backward import draw, draw_ends, draw_exactly, ended, log_kernel_from, walk
-from mpfjax.smoothing.history import mixtures_of, starts_of, with_parents
+from mpfjax.smoothing.history import mixtures_of, with_parents
 from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
 # Below this share of distinct states estimates of the past are poor, however many are drawn.
@@ -43,8 +43,7 @@ def sample_trajectories(
     Backward sampling (Godsill, Doucet and West 2004): x_t is drawn by the weights of the last
     mixture, then each x_{s} by W_s^i D(x_{s+1} | x_s^i), W_s the joint weights of the mixture at s.
     Component indicators have no part in it, since the weights are joint: a mixture filter is
-    smoothed like any other. Where a state began anew at s + 1 (`with_restarts`), x_s is drawn by
-    W_s alone, which is exact for the kernel with restarts.
+    smoothed like any other.
 
     - `mixtures`: a run of `run_filter(..., collect=None)`, or the mixtures that it collected.
     - `num_trajectories`: k. Leaves of the result are (k, t + 1, ...); (k, t, ...), without x_0, for
@@ -63,10 +62,10 @@ def sample_trajectories(
       each x_s given these and y_1..y_t. It needs a whole run, with x_0, and method "exact".
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
-    that is not there or dead, and for "mcmc" where particles have no single ancestors, as with
-    restarts (index -1; RuntimeError within jit); a RuntimeError where no particle can have moved to
-    the next. If the backward weights degenerate, so that at some time fewer than
-    a tenth of the trajectories are distinct, a RuntimeWarning names the share. Use it for estimates
+    that is not there or dead, a run with restarts, and for "mcmc" where particles have no single
+    ancestors (index -1; both a RuntimeError within jit); a RuntimeError where no particle can have
+    moved to the next. If the backward weights degenerate, so that at some time fewer than a tenth
+    of the trajectories are distinct, a RuntimeWarning names the share. Use it for estimates
     of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but has few
     distinct states at early times.
     """
@@ -84,7 +83,7 @@ def sample_trajectories(
         _check_component(stacked, component)
     if is_marginalised(model) or observations is not None:
         observations = as_arrays(gathered(observations).observations)
-        stacked = check_marginalised(model, stacked, observations, method)
+        check_marginalised(model, stacked, observations, method)
         drawn, indices = sample_marginalised(
             key, model, stacked, observations, inputs, num_trajectories, component
         )
@@ -117,12 +116,11 @@ def draw_trajectories(
 
     def back(carry: tuple[PyTree, Array], step: Any) -> tuple[tuple[PyTree, Array], PyTree]:
         next_states, next_indices = carry
-        step_key, earlier, ancestors, began_anew, proposed, now = step
+        step_key, earlier, ancestors, proposed, now = step
         moved_by = with_inputs(model, now)
         if proposed is None:
-            futures = next_states, take(began_anew, next_indices)
             log_kernel = log_kernel_from(moved_by, earlier)
-            drawn = draw_exactly(step_key, log_kernel, futures, earlier, checked=checked)
+            drawn = draw_exactly(step_key, log_kernel, next_states, earlier, checked=checked)
             indices = drawn[:, 0]
         else:
             start = take(ancestors, next_indices)
@@ -139,7 +137,7 @@ def draw_trajectories(
         shape = (num_moves, num_trajectories)
         proposed = jax.vmap(lambda key, logs: draw(key, shape, logs))(keys, earlier.log_weights)
     keys = jax.random.split(key_steps, num_earlier)
-    steps = (keys, earlier, ancestors, starts_of(mixtures)[1:], proposed, inputs)
+    steps = (keys, earlier, ancestors, proposed, inputs)
     _, past = jax.lax.scan(back, (states, last), steps, reverse=True)
     states, indices = ended(past, (states, last))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states), indices
@@ -151,21 +149,19 @@ def _warn_of_few(indices: Int[Array, "t k"], mixtures: ParticleMixture) -> None:
     The share at a time is the number of distinct particles over the largest possible number: that
     of the trajectories, or of the particles of positive weight where these are fewer. It may be
     small where few particles fit, although each of these has many pasts, and so counts only where
-    trajectories that share a particle nearly always share the one before as well, unless that
-    particle began anew, whose past is any. Within the caller's own jit there is no warning.
+    trajectories that share a particle nearly always share the one before as well. Within the
+    caller's own jit there is no warning.
     """
-    arrays = indices, mixtures.log_weights, mixtures.ancestor_indices
+    arrays = indices, mixtures.log_weights
     if any(isinstance(leaf, Tracer) or not leaf.is_fully_addressable for leaf in arrays):
         return
     num_particles = mixtures.log_weights.shape[1]
     drawn = np.asarray(indices, np.int64)[:, :num_particles]
     num_drawn, counts = drawn.shape[1], _num_distinct(drawn)
     few = np.flatnonzero(counts[:-1] < _SMALL_SHARE * num_drawn)
-    starts = np.take_along_axis(np.asarray(starts_of(mixtures)), drawn, axis=1)
-    goes_on = ~starts[1:].any(axis=1)
-    shared = (num_drawn - counts[1:])[goes_on].sum()
+    shared = (num_drawn - counts[1:]).sum()
     own_pasts = _num_distinct(drawn[:-1] * num_particles + drawn[1:]) - counts[1:]
-    if few.size == 0 or own_pasts[goes_on].sum() > _SMALL_SHARE * shared:
+    if few.size == 0 or own_pasts.sum() > _SMALL_SHARE * shared:
         return
     possible = (np.asarray(mixtures.log_weights)[few] > -np.inf).sum(axis=1)
     shares = counts[few] / np.minimum(num_drawn, possible)

@@ -7,7 +7,6 @@ import pytest
 
 import mpfjax
 from mpfjax import Every, KMeans, Merge, Propagate, Split
-from mpfjax.moves.restarts import RegroupOthers
 from tests.registry import RandomLabels
 
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
@@ -85,9 +84,8 @@ class Odd(mpfjax.AbstractRegrouping):
         return increment + 1
 
 
-@pytest.mark.parametrize("wrapper", [lambda move: Every(1, [KMeans(), move]), RegroupOthers])
-def test_a_move_that_holds_moves_forwards_all_that_they_are(wrapper):
-    move = wrapper(Odd())
+def test_a_move_that_holds_moves_forwards_all_that_they_are():
+    move = Every(1, [KMeans(), Odd()])
     for name in ("approximate", "needs_parents", "biases_score", "keeps_mass"):
         assert getattr(move, name), name
     for name in ("keeps_parents", "keeps_families", "weighs"):

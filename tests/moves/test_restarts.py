@@ -1,4 +1,4 @@
-"""Restarts: exact for their kernel, found again after being carried away, and cheap elsewhere."""
+"""Restarts: exact where the alarm sends one back, found again; an alarm only where it is due."""
 
 import warnings
 
@@ -6,78 +6,112 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.stats
 
 import mpfjax
-from mpfjax.moves.alarm import SURPRISE, is_alarmed
-from mpfjax.smoothing import (
-    FixedLagSmoother,
-    conditional_filter,
-    sample_trajectories,
-    smoothed_sums,
-)
+from mpfjax.exact import kalman_filter
+from mpfjax.mixture import single_component
+from mpfjax.moves.alarm import is_alarmed
+from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_sums
 from tests.marking import quick_of
+from tests.moves.start.test_start import KEY, SEEN, mean
+from tests.moves.start.test_window import PLANE, WithKeys
 from tests.unbiased import assert_unbiased
 from tests.user_models import ScalarLinear
 
 MODEL = ScalarLinear()
-# The fourth and fifth are where only a restart gets to.
-OBSERVATIONS = np.array([0.3, -0.9, -1.2, 1.5, 1.4, np.nan, 0.5], np.float32)
-PROBABILITY = 0.1
-SEEDS = 400
+OBSERVATIONS = np.array([0.3, -0.9, -1.2, 1.5, 1.4], np.float32)
 
 
-def log_evidence_on_a_grid():
-    """log p(y_1..y_t) where x_{t-1} is drawn anew with probability p, by sums over a grid."""
-    points = np.linspace(-8, 8, 1601)
-    normal = scipy.stats.norm.pdf
-    prior = normal(points, 0.5)
-    prior /= prior.sum()
-    step = normal(points[None], 0.9 * points[:, None], 0.6) * (points[1] - points[0])
-    law, total = prior, 0.0
-    for y in OBSERVATIONS:
-        law = ((1 - PROBABILITY) * law + PROBABILITY * prior) @ step
-        law = law if np.isnan(y) else law * normal(y, points, 0.5)
-        total += np.log(law.sum())
-        law = law / law.sum()
-    return total
+# Carried away after six steps; the alarm rings at once, and the start is by the next three.
+CARRIED = np.concatenate([SEEN[:6], SEEN[:6] - 12.0])
+PROBABILITY = 0.01
+PLAIN = mpfjax.mixture_particle_filter(WithKeys(), 100, 3)
+FILTER = mpfjax.with_restarts(
+    mpfjax.with_start(PLAIN, 3), probability=PROBABILITY, num_observations=3
+)
 
 
-FILTERS = {
-    "particle filter": mpfjax.particle_filter(MODEL, 60),
-    "mixture": mpfjax.mixture_particle_filter(MODEL, 120, 3, regroup_every=2),
-    "look-ahead": mpfjax.with_lookahead(mpfjax.particle_filter(MODEL, 60)),
-    "nested": mpfjax.with_proposals_per_particle(mpfjax.particle_filter(MODEL, 60), 3),
-}
-
-
-@pytest.mark.parametrize("name", quick_of(FILTERS, ["mixture"]))
-def test_evidence_is_unbiased_for_the_kernel(name):
-    filter = mpfjax.with_restarts(FILTERS[name], probability=PROBABILITY)
-    keys = jax.random.split(jax.random.key(0), SEEDS)
-    runs = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, lambda mixture: None, missing="skip")
-    ratios = np.exp(np.asarray(runs.log_marginal_likelihood) - log_evidence_on_a_grid())
-    error = ratios.std() / np.sqrt(SEEDS)
-    assert abs(ratios.mean() - 1) < 4 * error
-    assert error < 0.06
-
-
-def test_of_a_part_of_the_slots_they_take_a_share_of_that_part():
-    """The alarm rings; the survivors keep three quarters of the slots that may be used."""
-    filter = mpfjax.with_restarts(mpfjax.particle_filter(MODEL, 240), probability=PROBABILITY)
-    mixture = filter.init(jax.random.key(0))
-    log_weights = jnp.where(jnp.arange(240) < 40, -jnp.log(40.0), -jnp.inf)
-    mixture = mixture.replace(
-        log_weights=log_weights, usable_slots=jnp.int32(40), memory={SURPRISE: jnp.float32(9.0)}
+def log_evidence_with_a_restart():
+    """log p(y), where the state began anew after the sixth step with probability p."""
+    alone, before, after = (
+        float(kalman_filter(PLANE, part).log_marginal_likelihood)
+        for part in (CARRIED, CARRIED[:6], CARRIED[6:])
     )
-    moved, info = filter.step(jax.random.key(1), mixture, jnp.float32(0.3))
-    np.testing.assert_array_equal(moved.component_counts, [30, 10])
-    assert info.log_likelihood_increment > -3
+    return np.logaddexp(np.log1p(-PROBABILITY) + alone, np.log(PROBABILITY) + before + after)
 
 
-def test_particles_for_every_component_must_be_left():
-    with pytest.raises(ValueError, match="num_particles: 15 is less than 4 for restarts and one"):
-        mpfjax.with_restarts(mpfjax.mixture_particle_filter(MODEL, 15, 12))
+@pytest.mark.parametrize("islands", quick_of([1, 2], [1]))
+def test_evidence_and_moments_are_those_of_a_state_that_began_anew(islands):
+    """Of a start by the first three observations, and one by those from the seventh on."""
+
+    def run(key):
+        filter = FILTER.replace(num_particles=60)
+        return mpfjax.run_islands(key, filter, CARRIED, mean, num_islands=islands)
+
+    keys = jax.random.split(KEY, 200)
+    if islands == 1:
+        runs = mpfjax.monte_carlo(keys, FILTER, CARRIED, mean)
+    else:
+        runs = jax.jit(jax.vmap(run))(keys)
+    surprised = np.asarray(runs.surprised)
+    assert surprised[:, 6:8].all()
+    assert not surprised[:, 8:].any()
+    log_z = log_evidence_with_a_restart()
+    ratios = np.exp(np.asarray(runs.log_marginal_likelihood) - log_z)
+    assert_unbiased(ratios, 1.0, loosest=0.05, errors=3.0)
+    if islands == 1:
+        means = kalman_filter(PLANE, CARRIED[6:]).means[-1]
+        assert_unbiased(ratios[:, None] * np.asarray(runs.collected)[:, -1], means, loosest=0.5)
+
+
+@pytest.mark.parametrize("log_new", [-3.0, 400.0])
+def test_both_have_the_mass_of_their_evidence(log_new):
+    """Old ones, at zero, grew by e^-4 before this step and by e^-2 in it; new ones are at one."""
+    move, p = FILTER.moves[0], PROBABILITY
+    old = single_component(jnp.zeros((100, 2)), 3).replace(
+        component_indicators=jnp.arange(100) % 3, log_scale=jnp.float32(-2.0)
+    )
+    new = single_component(jnp.ones((100, 2))).replace(log_scale=jnp.float32(log_new))
+    joined = move._joined(KEY, old, new, jnp.float32(-4.0))
+    both = np.log1p(-p) - 2.0, np.log(p) + log_new + 4.0
+    np.testing.assert_allclose(joined.log_mass, np.logaddexp(*both), rtol=1e-5)
+    share = np.exp(both[1] - np.logaddexp(*both))
+    at_one = np.asarray(joined.particles[:, 0] == 1)
+    weights = np.exp(np.asarray(joined.log_weights - (joined.log_mass - joined.log_scale)))
+    np.testing.assert_allclose(weights[at_one].sum(), share, rtol=1e-4)
+    assert at_one.sum() == np.clip(round(100 * share), 6, 94)
+
+
+def test_smoothing_refuses_a_run_with_restarts():
+    mixtures = single_component(jnp.zeros((6, 2)), 3)
+    some = mixtures.replace(ancestor_indices=jnp.array([0, 1, 2, 3, -1, -1]))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), mixtures, some, mixtures)
+    with pytest.raises(ValueError, match="restarts"):
+        sample_trajectories(KEY, WithDensity(), stacked, 5)
+    filter = FILTER.replace(model=WithDensity())
+    with pytest.raises(ValueError, match="restarts"):
+        conditional_filter(KEY, filter, CARRIED, np.zeros((13, 2), np.float32))
+
+
+@pytest.mark.exactness
+def test_online_smoothing_ends_where_a_state_begins_anew():
+    filter = FILTER.replace(model=WithDensity())
+    with pytest.raises(RuntimeError, match="restarts"):
+        smoothed_sums(KEY, filter, CARRIED, lambda before, now: now[:, 0])
+
+
+class WithDensity(WithKeys):
+    """With the density of a step."""
+
+    def log_transition(self, states, previous_states):
+        return jnp.sum(jax.scipy.stats.norm.logpdf(states, previous_states, 0.1), axis=1)
+
+
+def test_what_cannot_restart_is_refused():
+    with pytest.raises(ValueError, match="num_particles: 40, of which 2 may be all of the slots"):
+        mpfjax.with_restarts(mpfjax.mixture_particle_filter(WithKeys(), 40, 12))
+    with pytest.raises(ValueError, match="defines no log_initial"):
+        mpfjax.with_restarts(mpfjax.particle_filter(MODEL, 50))
 
 
 def test_an_impossible_step_does_not_turn_the_alarm_off_for_ever():
@@ -109,53 +143,14 @@ def test_a_change_of_the_model_reaches_the_alarm():
     np.testing.assert_array_equal(*(run.log_evidence_against_start for run in runs))
 
 
-@pytest.mark.exactness
-def test_smoothing_knows_that_states_began_anew():
-    """Beside a smoother on a grid whose kernel has the restarts."""
-    points, normal = np.linspace(-8, 8, 801), scipy.stats.norm.pdf
-    seen = OBSERVATIONS[:5]
-    prior = normal(points, 0.5)
-    prior /= prior.sum()
-    step = normal(points[None], 0.9 * points[:, None], 0.6) * (points[1] - points[0])
-    kernel = (1 - PROBABILITY) * step + PROBABILITY * (prior @ step)[None]
-    filtered, future, exact = [prior], np.ones_like(points), []
-    for y in seen:
-        law = (filtered[-1] @ kernel) * normal(y, points, 0.5)
-        filtered.append(law / law.sum())
-    for t in reversed(range(len(filtered))):
-        smoothed = filtered[t] * future
-        exact.append(points @ smoothed / smoothed.sum())
-        future = kernel @ (normal(seen[t - 1], points, 0.5) * future)
-    exact = np.array(exact[::-1])
-    filter = mpfjax.with_restarts(mpfjax.particle_filter(MODEL, 300), probability=PROBABILITY)
-
-    def before(previous, states):
-        return previous
-
-    @jax.jit
-    @jax.vmap
-    def smooth(key):
-        run = mpfjax.run_filter(key, filter, seen)
-        paths = sample_trajectories(jax.random.fold_in(key, 1), MODEL, run, 100)
-        sums = smoothed_sums(key, filter, seen, before).sums[-1]
-        return paths.mean(axis=0), sums, run.log_marginal_likelihood
-
-    means, sums, log_evidence = smooth(jax.random.split(jax.random.key(2), 60))
-    weights = np.exp(np.asarray(log_evidence) - np.max(log_evidence))
-    weights /= weights.mean()
-    assert_unbiased(weights[:, None] * (np.asarray(means) - exact), 0.0, loosest=0.05)
-    assert_unbiased(weights * (np.asarray(sums) - exact[:-1].sum()), 0.0, loosest=0.15)
-    with pytest.raises(ValueError, match="restarts"):
-        FixedLagSmoother(filter, before, 1, "mcmc")
-    with pytest.raises(ValueError, match="restarts"):
-        conditional_filter(jax.random.key(0), filter, seen, np.zeros(6, np.float32))
-
-
 class Kidnapped(ScalarLinear):
     """A walk on a line 40 units long, of which it is told where it is; its prior is the line."""
 
     def sample_initial(self, key, num_particles):
         return jax.random.uniform(key, (num_particles,), minval=-20.0, maxval=20.0)
+
+    def log_initial(self, states):
+        return jnp.where(jnp.abs(states) < 20, 0.0, -jnp.inf)
 
 
 def nothing(mixture):
@@ -208,9 +203,7 @@ def test_collect_sees_the_time_and_the_inputs():
     def collect(mixture, t, inputs):
         return t, inputs
 
-    filter = FILTERS["particle filter"]
-    times, inputs = mpfjax.run_filter(
-        jax.random.key(0), filter, OBSERVATIONS[:5], collect
-    ).collected
+    filter = mpfjax.particle_filter(MODEL, 60)
+    times, inputs = mpfjax.run_filter(KEY, filter, OBSERVATIONS, collect).collected
     np.testing.assert_array_equal(times, [1, 2, 3, 4, 5])
     assert inputs is None

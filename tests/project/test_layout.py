@@ -18,7 +18,7 @@ FLOORS = {
     """,
     "moves": """
         base alarm eve_indices conditional every regrouping resampling propagation metropolis
-        objects initial restarts start
+        objects initial start
     """,
     "vision": "files colour tracking boxes",
     "lookahead": "quadratics pilot twisted regression learned",

@@ -41,7 +41,7 @@ def test_the_mixtures_alone_give_trajectories_without_x_0():
 def test_rows_that_do_not_fit_together_are_drawn_in_turn(monkeypatch):
     """The same indices whether all densities are held at once or a few."""
     mixture = mpfjax.particle_filter(QUADRATIC, 50).init(jax.random.key(1))
-    futures = jnp.linspace(-2.0, 2.0, 9), jnp.zeros(9, bool)
+    futures = jnp.linspace(-2.0, 2.0, 9)
 
     def drawn():
         log_kernel = backward.log_kernel_from(QUADRATIC, mixture)

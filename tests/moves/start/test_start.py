@@ -1,5 +1,7 @@
 """The first steps of a filter by a tempered sampler: exact, one at a time or not."""
 
+from functools import partial
+
 import chex
 import equinox as eqx
 import jax
@@ -9,6 +11,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
+from mpfjax.moves.start.start import Start
 from mpfjax.smoothing import conditional_filter, sample_trajectories
 from tests.moves.start.test_window import PLANE, WithKeys
 from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, truth
@@ -146,18 +149,16 @@ def test_islands_have_the_masses_of_their_own_starts():
     assert_unbiased(ratios_to(kalman_filter(PLANE, SEEN), runs))
 
 
-@pytest.mark.exactness
-def test_restarts_begin_after_the_first_steps():
-    """In either order; they are so rare here that the exact answer is that without them."""
-    exact = kalman_filter(PLANE, SEEN)
-    both = (
-        mpfjax.with_restarts(FILTER, probability=1e-6),
-        mpfjax.with_start(mpfjax.with_restarts(PLAIN, probability=1e-6), LENGTH),
-    )
-    for filter in both:
-        runs = mpfjax.monte_carlo(jax.random.split(KEY, 200), filter, SEEN, mean)
-        assert_unbiased(ratios_to(exact, runs))
-        assert not np.asarray(runs.surprised).any()
+def test_a_start_and_restarts_are_one_whichever_comes_first():
+    restarts = partial(mpfjax.with_restarts, probability=0.1, num_observations=LENGTH)
+    both = restarts(FILTER), mpfjax.with_start(restarts(PLAIN), LENGTH)
+    assert eqx.tree_equal(*both)
+    assert sum(isinstance(move, Start) for move in both[0].moves) == 1
+
+
+def test_without_y_1_x_0_are_plain_draws():
+    mixture, _ = FILTER.step(KEY, FILTER.init(KEY), SEEN[0])
+    assert (np.asarray(mixture.ancestor_indices) >= 0).all()
 
 
 def test_what_cannot_begin_so_is_refused():
