@@ -114,7 +114,7 @@ class TestNetworkProposal:
             parameters={"network": lambda filter: filter.moves[1].proposal.network},
             num_seeds=64, progress=False,
         )  # fmt: skip
-        before, after = (-self.log_errors(filter, 1000) for filter in (start, run.filter))
+        before, after = (-self.log_errors(filter, 1000) for filter in (start, run.tuned))
         errors = [gap.std() / np.sqrt(1000) for gap in (before, after)]
         assert after.mean() > 4 * errors[1]
         assert after.mean() + 4 * np.hypot(*errors) < 0.8 * before.mean()

@@ -61,7 +61,7 @@ class Known(mpfjax.AbstractStateSpaceModel):
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize("options", [{}, {"method": "mcmc", "num_steps": 20}])
+@pytest.mark.parametrize("options", [{}, {"method": "mcmc", "num_moves": 20}])
 def test_few_states_that_have_many_pasts_are_no_reason(options):
     observations = np.cumsum(np.random.default_rng(1).normal(size=20)).astype(np.float32)
     run = mpfjax.run_filter(jax.random.key(0), mpfjax.particle_filter(Known(), 300), observations)

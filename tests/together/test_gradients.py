@@ -111,7 +111,7 @@ def test_plain_derivatives_are_biased():
 MOVES = {
     "resampling": lambda gradient: Resample(ess_threshold=0.5, gradient=gradient),
     "bootstrap": lambda gradient: Propagate(gradient=gradient),
-    "guided": lambda gradient: Propagate(mpfjax.GaussNewtonProposal(), gradient),
+    "guided": lambda gradient: Propagate(mpfjax.GaussNewtonProposal(), gradient=gradient),
     "halves": lambda gradient: Predict(gradient=gradient),
 }
 
