@@ -58,9 +58,11 @@ def centred(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
     return np.concatenate([boxes[:, :2] + boxes[:, 2:] / 2, boxes[:, 2:]], axis=1)
 
 
-def top_left(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
-    """(x, y, w, h) with (x, y) moved from the centre to the top-left corner."""
+def top_left(boxes: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k n"]:
+    """(x, y, w, h) with (x, y) moved from the centre to the top-left corner; points as they are."""
     boxes = np.asarray(boxes, float)
+    if boxes.shape[1] == 2:
+        return boxes
     return np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, 2:]], axis=1)
 
 
@@ -83,13 +85,14 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
 
 
 def read_detections(
-    path: str | Path, *, with_classes: bool = False
+    path: str | Path, *, with_classes: bool = False, points: bool = False
 ) -> Float[np.ndarray, "rows columns"]:
     """Read a MOTChallenge file of detections into rows (frame, id, x, y, w, h, score).
 
     The id, -1 in such files, has no meaning. For a file of six columns, without scores, the result
     has six columns too. With `with_classes` the eighth column is the class, a whole number, 0 for
-    none, and the result has eight. Separators, comments and headers are those of `read_tracks`.
+    none, and the result has eight. With `points` the rows are (frame, id, x, y), and a score and a
+    class where there are more columns. Separators, comments and headers are those of `read_tracks`.
     Raises `ValueError` with the file and the line for a row that cannot be parsed, holds a number
     that is not finite, lies in a frame before 1, has a score where other rows have none, or a class
     that is none; and for a file without any detection.
@@ -98,10 +101,12 @@ def read_detections(
     form = "frame,id,x,y,w,h,score and up to three more columns, as the lines before it"
     if with_classes:
         width, columns, form = 8, range(8, 11), "frame,id,x,y,w,h,score,class, from 0 on"
+    if points:
+        width, columns, form = 6, range(4, 7), "frame,id,x,y,score,class, as the lines before it"
     found = read_rows(path, form, columns, holds="detections")
     rows = [row[:width] for row in found.values()]
     for number, row in zip(found, rows, strict=True):
-        is_class = all(each >= 0 and each % 1 == 0 for each in row[7:])
+        is_class = all(each >= 0 and each % 1 == 0 for each in row[5 if points else 7 :])
         if len(row) != len(rows[0]) or not np.all(np.isfinite(row)) or not is_class:
             raise ValueError(f"{path}, line {number}: {shown(row)} is not {form}")
     return np.array(rows)

@@ -13,8 +13,7 @@ from mpfjax.checks import CountOrZero, checked, is_series, saying, shown, warn
 from mpfjax.vision.files.boxes import read_detections
 from mpfjax.vision.tracking.detections import Detections, to_masked_rows
 
-# Columns: frame, id, x, y, w, h, the score, where there is one, and the class if there are eight.
-_BOX, _SCORE, _CLASS = slice(2, 6), 6, 7
+_NAMES = {4: "frame,id,x,y,w,h,score", 2: "frame,id,x,y,score"}
 # A tracker that is made for rows of detections has room for at most so many objects.
 LEAST_ROOM, MOST_ROOM = 24, 1024
 _END = object()
@@ -23,7 +22,8 @@ _END = object()
 class Rows:
     """Rows (frame, id, x, y, w, h, score) as MOTChallenge files have them; the id is not read.
 
-    Where there are eight columns, the last is the class, as `read_detections` has it.
+    Where there are eight columns, the last is the class, as `read_detections` has it. Points have
+    two coordinates in the place of four, without w and h.
 
     Frames count from 1; in a frame without rows nothing is there. Without pixels `last` is the last
     frame, by default that of the last row.
@@ -31,11 +31,17 @@ class Rows:
 
     @checked
     def __init__(
-        self, rows: Float[np.ndarray, "r columns"], *, last: CountOrZero | None = None
+        self,
+        rows: Float[np.ndarray, "r columns"],
+        *,
+        last: CountOrZero | None = None,
+        coordinates: int = 4,
     ) -> None:
-        if rows.ndim != 2 or not (rows.size == 0 or 6 <= rows.shape[1] <= 10):
-            raise ValueError(f"detections: shape {rows.shape} is not of frame,id,x,y,w,h,score")
-        rows = rows if rows.size else np.zeros((0, 7))
+        self._score = 2 + coordinates
+        most = self._score + (4 if coordinates == 4 else 2)
+        if rows.ndim != 2 or not (rows.size == 0 or self._score <= rows.shape[1] <= most):
+            raise ValueError(f"detections: shape {rows.shape} is not of {_NAMES[coordinates]}")
+        rows = rows if rows.size else np.zeros((0, self._score + 1))
         rows = to_masked_rows(rows.shape[1], "detections", rows)
         bad = ~np.isfinite(rows[:, 0]) | (rows[:, 0] % 1 != 0) | (rows[:, 0] < 1)
         for number in np.flatnonzero(bad.filled(False))[:1]:
@@ -53,10 +59,9 @@ class Rows:
         """Those of a frame."""
         begin, end = np.searchsorted(self.frames, [number, number + 1])
         rows = self._rows[begin:end]
-        of_kind = rows[:, _CLASS] if rows.shape[1] == _CLASS + 1 else None
-        return Detections(
-            rows[:, _BOX], rows[:, _SCORE] if rows.shape[1] > _SCORE else None, of_kind
-        )
+        at, width = self._score, rows.shape[1]
+        of_kind = rows[:, at + 1] if width == at + 2 else None
+        return Detections(rows[:, 2:at], rows[:, at] if width > at else None, of_kind)
 
     def num_after(self, last: int) -> int:
         """How many rows lie in later frames."""
@@ -72,15 +77,15 @@ class Rows:
 Detector = Rows | Callable[[Any], Any] | Mapping[int, Any] | Iterable[Any]
 
 
-def as_detector(detections: Any) -> Detector:
+def as_detector(detections: Any, coordinates: int = 4) -> Detector:
     """Files and arrays as rows; a callable, a mapping and an iterable as they are.
 
     Raises `ValueError` for anything else, and for rows that are not in MOTChallenge's form.
     """
     if isinstance(detections, str | Path):
-        detections = read_detections(detections)
+        detections = read_detections(detections, points=coordinates == 2)
     if isinstance(detections, np.ndarray | jax.Array):
-        return Rows(np.asanyarray(detections))
+        return Rows(np.asanyarray(detections), coordinates=coordinates)
     is_detector = callable(detections) and not isinstance(detections, type)
     if is_detector or isinstance(detections, Rows | Mapping) or is_series(detections):
         return detections
@@ -112,7 +117,7 @@ def first_step(detector: Detector, first: int | None, frames_per_second: float) 
 
 
 def observed(
-    stills: Iterator[np.ndarray | None] | None, detector: Detector, first: int
+    stills: Iterator[np.ndarray | None] | None, detector: Detector, first: int, coordinates: int = 4
 ) -> Iterator[tuple[int, np.ndarray | None, Detections | None]]:
     """Number, pixels and detections of each frame; None where no detector ran.
 
@@ -145,7 +150,7 @@ def observed(
         if found is _END:
             raise ValueError(f"detections: end before the frames do, at frame {number}")
         named = f"detections: frame {number}"
-        yield number, still, None if found is None else Detections.of(found, named)
+        yield number, still, None if found is None else Detections.of(found, named, coordinates)
     if isinstance(detector, Rows) and (late := detector.num_after(number)):
         warn(f"detections: {late} lie in frames after the last, {number}, and were left out")
     if next(coming, _END) is not _END or (isinstance(detector, Mapping) and number < last):

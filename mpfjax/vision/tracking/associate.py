@@ -5,13 +5,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
-from mpfjax.vision.tracking.gaussian import Gaussian
+from mpfjax.vision.tracking.gaussian import Gaussian, along
 
 _FREEDOM = 4.0  # degrees, of Student's distribution of gaps
 _COLOUR_COST, _UNDECIDED = 14.0, 0.25  # of B², and where it is evidence neither for nor against
 _ADAPTATION = 0.14  # the share of a frame in an object's colours
 _WIDEST = -0.5  # log |S| counts as at most this: a detection at the prediction forms a pair
-_TEMPERATURE = 2.0  # above 1 it allows for cues that are not independent
+TEMPERATURE = 2.0  # above 1 it allows for cues that are not independent
 _ROUNDS, _SETTLED = 15, 1e-3  # most iterations of messages, and the change that ends them
 _RESOLVED = 1e-6  # odds of all others below this are not told from none
 
@@ -39,7 +39,7 @@ def learned_colours(
     seen: Float[np.ndarray, "m bins"],
     alone: Bool[np.ndarray, " m"],
 ) -> Float[np.ndarray, "m bins"]:
-    """The histograms after those of the detections, 0 where there is none.
+    """The histograms, or vectors, after those of the detections, 0 where there is none.
 
     The first one counts whole; later ones do where the object is `alone`: objects in contact would
     learn each other's colours.
@@ -51,24 +51,26 @@ def learned_colours(
 
 def mahalanobis(
     predicted: Gaussian,
-    errors: Float[np.ndarray, "4"],
-    places: Float[np.ndarray, "d 4"],
+    errors: Float[np.ndarray, " k"],
+    places: Float[np.ndarray, "d k"],
     beside: Float[np.ndarray, "m d"],
     slack: Float[np.ndarray, "2"] | None = None,
+    others: float = 0.0,
 ) -> Float[np.ndarray, "m d"]:
     """-2 log p of each detection under each prediction, up to a constant, with lengths in boxes.
 
     Student's density with ν = 4 degrees of freedom: (ν + 4) log(1 + |d - μ|² / ν) + log |S|. What
     has been unseen for long has a large |S|, and less of a claim. `beside`: what pairs cost beside
     distance, added to it. `slack`: deviations of x and y, in pixels, to be added to those of all
-    predictions. Pairs that x alone puts above a cost of 0 cost infinitely.
+    predictions. `others`: the cost that stands for the density of detections of nobody. Pairs that
+    x alone puts above a cost of 0 cost infinitely.
     """
     unit, place = predicted.unit, predicted.place
     total = predicted.var_place + (unit * errors) ** 2
     if slack is not None:
-        total = total + np.append(slack, [0, 0]) ** 2
+        total = total + along(place, slack) ** 2
     power = _FREEDOM + total.shape[1]
-    volumes = np.minimum(np.sum(np.log(total / unit**2), axis=1), _WIDEST)
+    volumes = np.minimum(np.sum(np.log(total / unit**2), axis=1) + others, _WIDEST)
     most = _FREEDOM * np.expm1((-volumes - np.min(beside, initial=0.0)) / power)
     # Most objects and detections are far apart: only near ones are worth all coordinates.
     near = (places[:, 0] - place[:, :1]) ** 2 < (most * total[:, 0])[:, None]
@@ -105,9 +107,11 @@ def marginals(log_odds: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
     return weighed / (none + np.sum(weighed, axis=1, keepdims=True))
 
 
-def probabilities(cost: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
+def probabilities(
+    cost: Float[np.ndarray, "m d"], temperature: float = TEMPERATURE
+) -> Float[np.ndarray, "m d"]:
     """The marginals of pairs by their costs, -2 log p; a row without a pair costs nothing."""
-    log_odds, possible = -cost / (2 * _TEMPERATURE), np.isfinite(cost)
+    log_odds, possible = -cost / (2 * temperature), np.isfinite(cost)
     # Most pairs have no rival, and those who have are few.
     rivals = possible & ((possible.sum(axis=1) > 1)[:, None] | (possible.sum(axis=0) > 1))
     block = np.ix_(rivals.any(axis=1), rivals.any(axis=0))

@@ -1,4 +1,4 @@
-"""The detections of a frame: boxes, and how sure the detector was of each."""
+"""The detections of a frame: boxes or points, and how sure the detector was of each."""
 
 from typing import Any, NamedTuple
 
@@ -18,35 +18,45 @@ _UNBOUNDED = (-np.inf, -np.inf, np.inf, np.inf)
 class Detections(NamedTuple):
     """What a detector found in one frame, a row for each; what it does not say is None.
 
-    - `boxes`: (k, 4), (x, y, w, h) with (x, y) the top-left corner, in pixels.
+    - `boxes`: (k, 4), (x, y, w, h) with (x, y) the top-left corner, in pixels; or points, (k, 2).
     - `scores`: (k,), how sure the detector was, on any scale, higher for surer.
     - `classes`: (k,), whole numbers from 1 on, and 0 for none.
+    - `vectors`: (k, e), of whatever tells objects apart, such as embeddings for re-identification,
+      on any scale; zeros where there is none.
 
     Boxes with a masked entry are no detections.
     """
 
-    boxes: Float[np.ndarray, "k 4"]
+    boxes: Float[np.ndarray, "k n"]
     scores: Float[np.ndarray, " k"] | None = None
     classes: Int[np.ndarray, " k"] | None = None
+    vectors: Float[np.ndarray, "k e"] | None = None
 
     @classmethod
-    def of(cls, found: Any, named: str) -> "Detections":
-        """What users hand over: boxes, or the fields in a tuple, as (boxes, scores).
+    def of(cls, found: Any, named: str, coordinates: int = 4) -> "Detections":
+        """What users hand over: boxes, or points, or a tuple as (boxes, scores, classes).
 
-        Raises `ValueError` for boxes that are not rows of four numbers, for scores and classes that
-        are not one number a box, and for classes that are not whole numbers from 0 on.
+        Raises `ValueError` for boxes that are not rows of four numbers, or points of two, for
+        scores and classes that are not one number a box, for classes that are not whole numbers
+        from 0 on, and for vectors that are not one finite row a box.
         """
-        several = isinstance(found, tuple) and len(found) in range(2, len(cls._fields) + 1)
+        several = isinstance(found, tuple) and len(found) in (2, 3)
         given: tuple[Any, ...] = found if several or isinstance(found, cls) else (found,)
-        rows = to_masked_rows(4, named, given[0])
+        rows = to_masked_rows(coordinates, named, given[0])
         rest: list[Any] = []
-        for each, values in zip(cls._fields[1:], given[1:], strict=False):
+        for each, values in zip(cls._fields[1:3], given[1:], strict=False):
             if values is not None:
                 values = np.ma.filled(np.ma.asarray(values, float), np.nan).reshape(-1)
                 if len(values) != len(rows):
                     raise ValueError(f"{named}: {len(values)} {each} for {len(rows)} boxes")
             rest.append(values)
         made = cls(rows, *rest)
+        if isinstance(found, cls) and found.vectors is not None:
+            vectors = np.asarray(found.vectors, float)
+            if vectors.ndim != 2 or len(vectors) != len(rows) or not np.isfinite(vectors).all():
+                said = f"{len(rows)} rows of finite numbers"
+                raise ValueError(f"{named}: vectors of shape {vectors.shape} are not {said}")
+            made = made._replace(vectors=vectors)
         if made.classes is None:
             return made
         if (made.classes % 1 != 0).any() or (made.classes < 0).any():
@@ -57,14 +67,15 @@ class Detections(NamedTuple):
 class Found(NamedTuple):
     """The detections of a frame that can be tracked, the strongest first, equal ones by area.
 
-    - `boxes`: (d, 4), centre and size in pixels; `scores`, `classes`: (d,), a class of 0 for none.
+    - `boxes`: (d, 4), centre and size in pixels; or (d, 2), points in deviations.
+    - `scores`, `classes`: (d,), a class of 0 for none.
     - `rows`: (d,), the row of each in what the detector gave.
     - `extent`: left, top, right, bottom of the frame; infinite where not known.
     - `left_out`: (3,), how many cannot be tracked, by `FAULTS`; `told`: what to say of each.
-    - `colours`: (d, bins), None without pixels.
+    - `colours`: (d, bins), None without pixels; `vectors`: (d, e), None where nobody gave them.
     """
 
-    boxes: Float[np.ndarray, "d 4"]
+    boxes: Float[np.ndarray, "d k"]
     scores: Float[np.ndarray, " d"]
     classes: Int[np.ndarray, " d"]
     rows: Int[np.ndarray, " d"]
@@ -72,11 +83,18 @@ class Found(NamedTuple):
     left_out: Int[np.ndarray, "3"]
     told: tuple[str, ...]
     colours: Float[np.ndarray, "d bins"] | None = None
+    vectors: Float[np.ndarray, "d e"] | None = None
 
     @classmethod
-    def of(cls, found: Detections, named: str, frame_size: tuple[int, int] | None) -> "Found":
-        """Leave out what cannot be tracked, and count it."""
-        rows, scores, classes = found
+    def of(
+        cls,
+        found: Detections,
+        named: str,
+        frame_size: tuple[int, int] | None,
+        deviation: float | None = None,
+    ) -> "Found":
+        """Leave out what cannot be tracked, and count it. `deviation`: of the errors of points."""
+        rows, scores, classes, vectors = found
         boxes = np.asarray(rows, float)
         scores = np.ones(len(rows)) if scores is None else scores
         keep = ~np.ma.getmaskarray(rows).any(axis=1)
@@ -84,7 +102,7 @@ class Found(NamedTuple):
         if frame_size is not None:
             extent = np.array([0, 0, frame_size[1], frame_size[0]], float)
         with np.errstate(invalid="ignore"):
-            far = boxes[:, :2] + boxes[:, 2:]
+            far = boxes[:, :2] + (0.0 if deviation else boxes[:, 2:])
             sound = (
                 np.isfinite(boxes).all(axis=1) & np.isfinite(scores),
                 (boxes[:, 2:] > 0).all(axis=1),
@@ -97,17 +115,18 @@ class Found(NamedTuple):
             first = f"row {wrong[0]}, {shown(boxes[wrong[0]].tolist())}, is" if len(wrong) else ""
             told.append(f"{named}, {first} {fault}; left out, as all such are")
         rows = np.flatnonzero(keep)
-        areas = boxes[rows, 2] * boxes[rows, 3]
+        areas = np.prod(boxes[rows, 2:], axis=1)
         rows = rows[np.lexsort((rows, -areas, -scores[rows]))]
         classes = np.zeros(len(scores), int) if classes is None else classes
-        kept = centred(boxes[rows]), scores[rows], classes[rows], rows
-        return cls(*kept, extent, left_out, tuple(told))
+        places = boxes[rows] / deviation if deviation else centred(boxes[rows])
+        kept, extent = (scores[rows], classes[rows], rows), extent / (deviation or 1.0)
+        vectors = None if vectors is None else vectors[rows]
+        return cls(places, *kept, extent, left_out, tuple(told), vectors=vectors)
 
     def at(self, chosen: np.ndarray | slice) -> "Found":
         """Some of them."""
-        return self._replace(
-            **{name: getattr(self, name)[chosen] for name in ("boxes", "scores", "classes", "rows")}
-        )
+        names = ["boxes", "scores", "classes", "rows", *["vectors"] * (self.vectors is not None)]
+        return self._replace(**{name: getattr(self, name)[chosen] for name in names})
 
     def warn_of_first(self, before: Int[np.ndarray, "3"]) -> None:
         """Warn of each fault that comes for the first time: so many came before."""
@@ -116,8 +135,8 @@ class Found(NamedTuple):
                 warn(said)
 
     @property
-    def places(self) -> Float[np.ndarray, "d 4"]:
-        """(x, y, log w, log h)."""
+    def places(self) -> Float[np.ndarray, "d k"]:
+        """(x, y, log w, log h), or (x, y)."""
         return places_of(self.boxes)
 
 

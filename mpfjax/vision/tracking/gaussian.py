@@ -1,4 +1,7 @@
-"""Boxes as four independent coordinates, and Gaussian moments of their places and velocities."""
+"""Boxes and points as independent coordinates, and Gaussian moments of places and velocities.
+
+A box has the coordinates (x, y, log w, log h) in pixels, a point (x, y) in deviations of its error.
+"""
 
 from typing import NamedTuple
 
@@ -7,55 +10,57 @@ from jaxtyping import Bool, Float
 
 # The share of a size's growth rate that is left after a frame.
 _GROWTH_KEPT = 0.9
+_FURTHER = np.log(20)  # a distance beyond which one in twenty is, as -log of its probability
 
 
 class Gaussian(NamedTuple):
-    """Moments of place and velocity along each of the four coordinates, which are independent.
+    """Moments of place and velocity along each of the coordinates, which are independent.
 
-    - `place`, `velocity`: the means; (x, y) in pixels, (log w, log h), and their change in a frame.
+    - `place`, `velocity`: the means, and their change in a frame.
     - `var_place`, `cov`, `var_velocity`: the entries of the covariance of place and velocity.
     """
 
-    place: Float[np.ndarray, "*n 4"]
-    velocity: Float[np.ndarray, "*n 4"]
-    var_place: Float[np.ndarray, "*n 4"]
-    cov: Float[np.ndarray, "*n 4"]
-    var_velocity: Float[np.ndarray, "*n 4"]
+    place: Float[np.ndarray, "*n k"]
+    velocity: Float[np.ndarray, "*n k"]
+    var_place: Float[np.ndarray, "*n k"]
+    cov: Float[np.ndarray, "*n k"]
+    var_velocity: Float[np.ndarray, "*n k"]
 
     @classmethod
     def none(cls, *shape: int) -> "Gaussian":
-        """Of no object: rows of this shape."""
-        return cls(*(np.zeros((0, *shape, 4)) for _ in cls._fields))
+        """Of no object: rows of this shape, of which the last are the coordinates."""
+        return cls(*(np.zeros((0, *shape)) for _ in cls._fields))
 
     @classmethod
     def begun(
         cls,
-        place: Float[np.ndarray, "*#n #4"],
-        error: Float[np.ndarray, "*#n #4"],
-        speed: Float[np.ndarray, "*#n #4"],
+        place: Float[np.ndarray, "*#n #k"],
+        error: Float[np.ndarray, "*#n #k"],
+        speed: Float[np.ndarray, "*#n #k"],
     ) -> "Gaussian":
         """At a first detection: the deviation of its error, and that of a velocity of mean zero."""
         still = 0.0 * error * speed
         return cls(place + still, still, error**2 + still, still, speed**2 + still)
 
     @property
-    def unit(self) -> Float[np.ndarray, "*n 4"]:
+    def unit(self) -> Float[np.ndarray, "*n k"]:
         """The units of length along each coordinate, by the mean box."""
         return units(self.place)
 
     def predicted(
         self,
-        place_noise: Float[np.ndarray, "*#n #4"],
-        velocity_noise: Float[np.ndarray, "*#n #4"],
-        unit: Float[np.ndarray, "*#n #4"],
+        place_noise: Float[np.ndarray, "*#n #k"],
+        velocity_noise: Float[np.ndarray, "*#n #k"],
+        unit: Float[np.ndarray, "*#n #k"],
         frames: float = 1.0,
     ) -> "Gaussian":
         """The moments so many frames later; growth rates of sizes decay, in the mean.
 
         In a frame x += v + noise and v += noise, with deviations in units of length.
         """
-        kept = np.array([1, 1, *[_GROWTH_KEPT**frames] * 2])
-        reach = np.array([frames, frames, *[(1 - kept[2]) / (1 - _GROWTH_KEPT)] * 2])
+        left, sizes = _GROWTH_KEPT**frames, self.place.shape[-1] - 2
+        kept = np.array([1, 1, *[left] * sizes])
+        reach = np.array([frames, frames, *[(1 - left) / (1 - _GROWTH_KEPT)] * sizes])
         return Gaussian(
             self.place + reach * self.velocity,
             kept * self.velocity,
@@ -66,8 +71,8 @@ class Gaussian(NamedTuple):
         )
 
     def updated(
-        self, detected: Float[np.ndarray, "*#n #4"], errors: Float[np.ndarray, "*#n #4"]
-    ) -> tuple["Gaussian", Float[np.ndarray, "*n 4"], Float[np.ndarray, "*n 4"]]:
+        self, detected: Float[np.ndarray, "*#n #k"], errors: Float[np.ndarray, "*#n #k"]
+    ) -> tuple["Gaussian", Float[np.ndarray, "*n k"], Float[np.ndarray, "*n k"]]:
         """Kalman's update by a detection: the posterior, the innovations and their variances."""
         variance = self.var_place + errors**2
         gap = detected - self.place
@@ -94,7 +99,7 @@ class Gaussian(NamedTuple):
 
     def shifted(self, shift: Float[np.ndarray, "2"]) -> "Gaussian":
         """The moments of what has been moved by (x, y)."""
-        return self._replace(place=self.place + np.append(shift, [0, 0]))
+        return self._replace(place=self.place + along(self.place, shift))
 
     def at(self, rows: np.ndarray) -> "Gaussian":
         """The moments of some rows."""
@@ -153,35 +158,52 @@ class CameraMotion(NamedTuple):
             return np.concatenate([a * x + b * y, c * x + a * y, rows[..., 2:]], axis=-1)
 
         place, velocity, *spread = moments
-        place = turned(place, a, -b, b) + np.append(self.shift, [growth, growth])
+        place = turned(place, a, -b, b) + along(place, self.shift, growth)
         spread = (turned(rows, a**2, b**2, b**2) for rows in spread)
         return Gaussian(place, turned(velocity, a, -b, b), *spread)
 
 
-def boxes_of(places: Float[np.ndarray, "*m 4"]) -> Float[np.ndarray, "*m 4"]:
-    """Centre and size in pixels, of places (x, y, log w, log h)."""
+def along(places: np.ndarray, of_place: np.ndarray, of_size: float = 0.0) -> np.ndarray:
+    """A value for each coordinate of places: for (x, y), and for sizes where there are any."""
+    return np.append(of_place, [of_size] * (places.shape[-1] - 2))
+
+
+def boxes_of(places: Float[np.ndarray, "*m k"]) -> Float[np.ndarray, "*m k"]:
+    """Centre and size in pixels, of places (x, y, log w, log h); points as they are."""
     return np.concatenate([places[..., :2], np.exp(places[..., 2:])], axis=-1)
 
 
-def places_of(boxes: Float[np.ndarray, "*m 4"]) -> Float[np.ndarray, "*m 4"]:
-    """(x, y, log w, log h) of boxes by centre and size."""
+def places_of(boxes: Float[np.ndarray, "*m k"]) -> Float[np.ndarray, "*m k"]:
+    """(x, y, log w, log h) of boxes by centre and size; points as they are."""
     return np.concatenate([boxes[..., :2], np.log(boxes[..., 2:])], axis=-1)
 
 
-def units(places: Float[np.ndarray, "*m 4"]) -> Float[np.ndarray, "*m 4"]:
-    """The units of length along each coordinate: (w, h, 1, 1)."""
+def units(places: Float[np.ndarray, "*m k"]) -> Float[np.ndarray, "*m k"]:
+    """The units of length along each coordinate: (w, h, 1, 1) of boxes, and 1 of points."""
     lengths = np.ones_like(places)
-    np.exp(places[..., 2:], out=lengths[..., :2])
+    np.exp(places[..., 2:], out=lengths[..., : places.shape[-1] - 2])
     return lengths
 
 
-def overlap(a: Float[np.ndarray, "m 4"], b: Float[np.ndarray, "d 4"]) -> Float[np.ndarray, "m d"]:
-    """Intersection over union of every box with every other."""
-    return shared(a[:, None], b[None])
+def overlap(
+    a: Float[np.ndarray, "m k"], b: Float[np.ndarray, "d k"], variance: float = 2.0
+) -> Float[np.ndarray, "m d"]:
+    """`shared` of every box or point with every other."""
+    return shared(a[:, None], b[None], variance)
 
 
-def shared(a: Float[np.ndarray, "*#n 4"], b: Float[np.ndarray, "*#n 4"]) -> np.ndarray:
-    """Intersection over union of boxes by centre and size, pair by pair."""
+def shared(
+    a: Float[np.ndarray, "*#n k"], b: Float[np.ndarray, "*#n k"], variance: float = 2.0
+) -> np.ndarray:
+    """Intersection over union of boxes by centre and size, pair by pair.
+
+    Of points it is told by their distance alone, whose variance along x and y is that of two errors
+    unless given: 1 where they are equal, and 1/2 where one in twenty pairs of the same point is
+    further apart.
+    """
+    if a.shape[-1] == 2:
+        distance = (a[..., 0] - b[..., 0]) ** 2 + (a[..., 1] - b[..., 1]) ** 2
+        return 0.5 ** (distance / (2 * variance * _FURTHER))
     # Coordinate by coordinate: arrays of pairs, and no larger ones.
     x, y = (
         np.minimum(a[..., k] + a[..., k + 2] / 2, b[..., k] + b[..., k + 2] / 2)
@@ -193,11 +215,13 @@ def shared(a: Float[np.ndarray, "*#n 4"], b: Float[np.ndarray, "*#n 4"]) -> np.n
 
 
 def within(
-    boxes: Float[np.ndarray, "k 4"],
+    boxes: Float[np.ndarray, "k n"],
     extent: Float[np.ndarray, "4"],
     centred: Bool[np.ndarray, " k"] | bool = False,
 ) -> Bool[np.ndarray, " k"]:
     """Whether any part of each box, or its centre, is inside left, top, right and bottom."""
-    half = np.where(np.reshape(centred, (-1, 1)), 0.0, boxes[:, 2:] / 2)
+    half = (
+        np.where(np.reshape(centred, (-1, 1)), 0.0, boxes[:, 2:] / 2) if boxes.shape[1] > 2 else 0
+    )
     low, high = boxes[:, :2] - half, boxes[:, :2] + half
     return np.all((high >= extent[:2]) & (low <= extent[2:]), axis=1)

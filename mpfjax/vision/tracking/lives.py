@@ -50,7 +50,8 @@ class Lives(NamedTuple):
     - `identities`: (m,); `classes`: (m,), 0 for none; `scores`: (m,), of the latest detection.
     - `seen`: (m,), in how many frames it had a strong detection.
     - `unseen`, `unsure`: (m,), for how many frames it has had no detection, and no strong one.
-    - `confirmed`: (m,), whether it has had enough; `shown`: (m,), whether it should be shown.
+    - `confirmed`: (m,), whether it has had enough; `odds`: (m,), in logarithms, that its points are
+      not of nobody, to those that confirm one, and 0 of boxes; `shown`: (m,), whether it should be shown.
     """
 
     identities: Int[np.ndarray, " m"]
@@ -61,14 +62,19 @@ class Lives(NamedTuple):
     unsure: Float[np.ndarray, " m"]
     confirmed: Bool[np.ndarray, " m"]
     shown: Bool[np.ndarray, " m"]
+    odds: Float[np.ndarray, " m"]
 
     @classmethod
     def begun(
-        cls, identities: Int[np.ndarray, " k"], classes: Int[np.ndarray, " k"], at_once: bool
+        cls,
+        identities: Int[np.ndarray, " k"],
+        classes: Int[np.ndarray, " k"],
+        at_once: bool,
+        odds: float = 0.0,
     ) -> "Lives":
-        """Those of new objects, which are confirmed at once in the first frame."""
+        """Those of new objects; boxes are confirmed at once in the first frame."""
         one, sure = np.ones_like(identities), np.full(len(identities), at_once)
-        return cls(identities, classes, 0.0 * one, one, 0.0 * one, 0.0 * one, sure, sure)
+        return cls(identities, classes, 0.0 * one, one, 0.0 * one, 0.0 * one, sure, sure, odds + 0.0 * one)
 
     def at(self, rows: np.ndarray) -> "Lives":
         """Those of some objects."""
@@ -98,12 +104,13 @@ class Lives(NamedTuple):
         spans: Spans,
         coast: float,
         full: bool,
+        gained: Float[np.ndarray, " m"] | float = 0.0,
     ) -> tuple["Lives", Bool[np.ndarray, " m"]]:
         """The lives after a frame's detections, so many frames after those before; who lives on.
 
         An object ends if it has had no detection for longer than the patience, or for more than one
-        frame while it is not confirmed. It is confirmed after two frames with strong detections, or
-        at once in the first frame. Where there is no room, an unconfirmed one ends in its first
+        frame while it is not confirmed. It is confirmed after two frames with strong detections
+        where its odds are for it, or at once in the first frame. Where there is no room, an unconfirmed one ends in its first
         frame without a detection, and one that was confirmed at once and has had no strong
         detections since ends as soon as it is no longer shown: after `coast` frames without a
         detection, or three tenths of a second without a strong one.
@@ -111,10 +118,11 @@ class Lives(NamedTuple):
         seen = self.seen + strong
         unseen = np.where(detected, 0.0, self.unseen + frames)
         unsure = np.where(strong, 0.0, self.unsure + frames)
-        confirmed = self.confirmed | (seen >= _CONFIRMED)
+        odds = self.odds + gained
+        confirmed = self.confirmed | ((seen >= _CONFIRMED) & (odds >= 0))
         recent = confirmed & (unseen <= coast) & (unsure <= spans.unsure)
         lives = self._replace(
-            seen=seen, unseen=unseen, unsure=unsure, confirmed=confirmed, shown=recent
+            seen=seen, unseen=unseen, unsure=unsure, confirmed=confirmed, shown=recent, odds=odds
         )
         in_the_way = full & (seen < _CONFIRMED)
         tentative = 0 if full else _TENTATIVE * frames

@@ -13,70 +13,80 @@ _ERRORS = (0.01, 0.02, 0.04, 0.08, 0.16)
 _PLACES = (0.005, 0.015, 0.045)
 _VELOCITIES = (0.001, 0.005, 0.025, 0.1)
 _GRID = np.array([(r, q, v) for r in _ERRORS for q in _PLACES for v in _VELOCITIES])
-_RIVALS = _GRID.T[:, None, :, None]  # for all objects and coordinates
 # Means of the log-normal priors along (x, y, log w, log h), and their standard deviations.
 _PRIOR = np.array(
     [(0.03, 0.03, 0.04, 0.04), (0.02, 0.015, 0.03, 0.02), (0.01, 0.006, 0.003, 0.003)]
 )
-_LOG_GRID, _LOG_PRIOR = np.log(_RIVALS[:, 0]), np.log(_PRIOR)[:, None]
 _DOUBTS = np.array([0.7, 0.7, 0.9])
 # The deviation of a newborn object's velocity at 25 frames a second, and at most times as large.
 _SPEED, _MOST = np.array([0.1, 0.05, 0.05, 0.03]), 2.5
+# Of points, in deviations of their errors, which are given: what moves steadily has nearly no noise
+# of its place, and what walks at random much.
+_POINT_PLACES, _POINT_VELOCITIES = (0.01, 0.1, 0.4, 1.6), (0.003, 0.03, 0.15, 0.8, 4.0)
+_POINT_GRID = np.array([(1.0, q, v) for q in _POINT_PLACES for v in _POINT_VELOCITIES])
+_POINT_PRIOR, _POINT_DOUBTS = np.array([(1.0,) * 2, (0.2,) * 2, (0.2,) * 2]), np.full(3, 1.5)
+_POINT_SPEED = np.full(2, 3.0)
 # The prior of newborn speeds counts as so many objects; of so many later ones, one is forgotten.
 _NEWBORN, _LATEST = 4.0, 50.0
 _MEMORY = 20.0  # frames after which evidence is forgotten
 _FREEDOM = 4.0  # degrees, of Student's distribution of innovations
 
 
+# By the number of coordinates, for all objects.
+_RIVALS = {4: _GRID.T[:, None, :, None], 2: _POINT_GRID.T[:, None, :, None]}
+_BEFORE = {4: (_PRIOR, _DOUBTS, _SPEED), 2: (_POINT_PRIOR, _POINT_DOUBTS, _POINT_SPEED)}
+
+
 class Noises(NamedTuple):
-    """Standard deviations along (x, y, log w, log h), lengths in boxes.
+    """Standard deviations along each coordinate, lengths in boxes or errors of points.
 
     - `errors`: of a strong detection.
     - `place`, `velocity`: of the noise added to an object's place and velocity in a frame.
     - `speed`: of an object's velocity at its first detection.
     """
 
-    errors: Float[np.ndarray, "4"]
-    place: Float[np.ndarray, "4"]
-    velocity: Float[np.ndarray, "4"]
-    speed: Float[np.ndarray, "4"]
+    errors: Float[np.ndarray, " k"]
+    place: Float[np.ndarray, " k"]
+    velocity: Float[np.ndarray, " k"]
+    speed: Float[np.ndarray, " k"]
 
 
 class NoiseState(NamedTuple):
     """What is known of the noises: L candidates (errors, place, velocity) for each coordinate.
 
-    - `moments`: (m, L, 4) each, every object under every candidate.
-    - `evidence`: (L, 4), discounted log-likelihoods of all objects together.
+    - `moments`: (m, L, k) each, every object under every candidate.
+    - `evidence`: (L, k), discounted log-likelihoods of all objects together.
     - `squares`, `newborn`: sum of squared velocities of newborn objects, in boxes; their number.
     - `start`: the prior deviation of a newborn object's velocity.
     - `noises`: what is believed.
     """
 
     moments: Gaussian
-    evidence: Float[np.ndarray, "l 4"]
-    squares: Float[np.ndarray, "4"]
+    evidence: Float[np.ndarray, "l k"]
+    squares: Float[np.ndarray, " k"]
     newborn: float
-    start: Float[np.ndarray, "4"]
+    start: Float[np.ndarray, " k"]
     noises: Noises
 
     @classmethod
-    def initial(cls, frames_per_second: float) -> "NoiseState":
+    def initial(cls, frames_per_second: float, coordinates: int = 4) -> "NoiseState":
         """Before any frame: the means of the priors. New objects move further at a lower rate."""
-        start = min(25 / frames_per_second, _MOST) * _SPEED
-        moments, evidence = Gaussian.none(len(_GRID)), np.zeros((len(_GRID), 4))
-        return cls(moments, evidence, np.zeros(4), 0.0, start, Noises(*_PRIOR, speed=start))
+        prior, _, speed = _BEFORE[coordinates]
+        start = min(25 / frames_per_second, _MOST) * speed
+        shape, noises = (_RIVALS[coordinates].shape[2], coordinates), Noises(*prior, speed=start)
+        return cls(Gaussian.none(*shape), np.zeros(shape), 0.0 * start, 0.0, start, noises)
 
     def predicted(self, frames: float) -> "NoiseState":
         """Every object under every candidate, later; each candidate has its own units."""
-        _, place, velocity = _RIVALS
+        _, place, velocity = _RIVALS[self.evidence.shape[1]]
         moments = self.moments.predicted(place, velocity, self.moments.unit, frames)
         return self._replace(moments=moments)
 
     def after(
         self,
         rows: np.ndarray,
-        places: Float[np.ndarray, "k 4"],
-        teaches: Bool[np.ndarray, " k"],
+        places: Float[np.ndarray, "n k"],
+        teaches: Bool[np.ndarray, " n"],
         grown: Gaussian,
     ) -> "NoiseState":
         """Update the objects in these rows by their detections, and the evidence.
@@ -92,7 +102,9 @@ class NoiseState(NamedTuple):
         """
         predicted = self.moments.at(rows)
         unit = predicted.unit
-        posterior, gap, variance = predicted.updated(places[:, None], unit * _RIVALS[0])
+        posterior, gap, variance = predicted.updated(
+            places[:, None], unit * _RIVALS[self.evidence.shape[1]][0]
+        )
         self.moments.put(rows, posterior)
         gap, variance, unit = gap[teaches], variance[teaches], unit[teaches]
         tails = 0.5 * (_FREEDOM + 1) * np.log1p(gap**2 / variance / _FREEDOM)
@@ -101,17 +113,21 @@ class NoiseState(NamedTuple):
         evidence = np.exp(-1 / _MEMORY) * self.evidence + 0.5 * density
         squares, newborn = self._speeds(grown)
         speed = np.sqrt((_NEWBORN * self.start**2 + squares) / (_NEWBORN + newborn))
-        log_prior = -0.5 * np.sum(((_LOG_GRID - _LOG_PRIOR) / _DOUBTS[:, None, None]) ** 2, axis=0)
-        believed = softmax(evidence + log_prior, axis=0)
-        noises = Noises(*np.exp(np.sum(believed[None] * _LOG_GRID, axis=1)), speed=speed)
+        prior, doubts, _ = _BEFORE[evidence.shape[1]]
+        logs = np.log(_RIVALS[evidence.shape[1]][:, 0])
+        away = (logs - np.log(prior)[:, None]) / doubts[:, None, None]
+        believed = softmax(evidence - 0.5 * np.sum(away**2, axis=0), axis=0)
+        noises = Noises(*np.exp(np.sum(believed[None] * logs, axis=1)), speed=speed)
         return NoiseState(self.moments, evidence, squares, newborn, self.start, noises)
 
-    def begun(self, places: Float[np.ndarray, "k 4"], speed: Float[np.ndarray, "4"]) -> Gaussian:
+    def begun(self, places: Float[np.ndarray, "n k"], speed: Float[np.ndarray, " k"]) -> Gaussian:
         """New objects under every candidate."""
         unit = units(places)[:, None]
-        return Gaussian.begun(places[:, None], unit * _RIVALS[0], unit * speed)
+        return Gaussian.begun(
+            places[:, None], unit * _RIVALS[self.evidence.shape[1]][0], unit * speed
+        )
 
-    def _speeds(self, grown: Gaussian) -> tuple[Float[np.ndarray, "4"], float]:
+    def _speeds(self, grown: Gaussian) -> tuple[Float[np.ndarray, " k"], float]:
         """The sum of squared velocities of newborn objects and their number, with this frame's.
 
         The sum is weighted by a step of expectation maximisation for Student's scale.

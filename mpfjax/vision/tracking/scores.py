@@ -29,8 +29,8 @@ class ScoreState(NamedTuple):
 
     - `recent`: the latest scores, at most 8192.
     - `weak`, `strong`: the least score that counts, and from which on a detection is strong.
-    - `boxes`: (c, 4), the last box of each living chain, moved with the camera; `unseen`: frames
-      with detections since its last one.
+    - `boxes`: (c, 4), the last box of each living chain, or (c, 2), moved with the camera;
+      `unseen`: frames with detections since its last one.
     - `age`: frames since its first detection, which counts as one; `sure`: whether it has proved to
       be an object; `pending`: (c, bins), its detections by share while that is not decided.
     - `good`, `bad`: (bins,), detections of chains that proved to be objects, and of chains that
@@ -40,7 +40,7 @@ class ScoreState(NamedTuple):
     recent: Float[np.ndarray, " k"]
     weak: float
     strong: float
-    boxes: Float[np.ndarray, "c 4"]
+    boxes: Float[np.ndarray, "c k"]
     unseen: Int[np.ndarray, " c"]
     age: Float[np.ndarray, " c"]
     sure: Bool[np.ndarray, " c"]
@@ -49,20 +49,21 @@ class ScoreState(NamedTuple):
     bad: Float[np.ndarray, " bins"]
 
     @classmethod
-    def initial(cls) -> "ScoreState":
+    def initial(cls, coordinates: int = 4) -> "ScoreState":
         """No score seen yet, and no chain."""
         none, bins = np.zeros(0, int), np.zeros(_BINS)
-        chains = np.zeros((0, 4)), none, 0.0 * none, none > 0, np.zeros((0, _BINS))
+        chains = np.zeros((0, coordinates)), none, 0.0 * none, none > 0, np.zeros((0, _BINS))
         return cls(np.zeros(0), 0.0, 0.0, *chains, bins, bins)
 
     def after(
         self,
-        boxes: Float[np.ndarray, "d 4"],
+        boxes: Float[np.ndarray, "d k"],
         scores: Float[np.ndarray, " d"],
         overlaps: Float[np.ndarray, "d d"],
-        moved: Float[np.ndarray, "c 4"],
+        moved: Float[np.ndarray, "c k"],
         frames: float,
         lasting: float,
+        variance: float = 2.0,
     ) -> "ScoreState":
         """Remember the frame's scores, continue the chains, and set the thresholds.
 
@@ -78,7 +79,8 @@ class ScoreState(NamedTuple):
 
         made non-decreasing in the score by isotonic regression. Detections are strong from 1/2 on.
         Counts lose four tenths in a hundred frames. The chains' boxes have `moved` with the camera.
-        Detections come strongest first, so many `frames` after those before.
+        Detections come strongest first, so many `frames` after those before. `variance`: of the
+        distance of a point from one frame to the next.
         """
         recent = np.concatenate([self.recent, scores])[-_REMEMBERED:]
         rank = int(np.ceil(_HIGH * (len(recent) - 1)))
@@ -87,7 +89,7 @@ class ScoreState(NamedTuple):
         spread = sure - lowest
         shares = (scores - lowest) / spread if spread > 0 else np.ones_like(scores)
         single = ~(np.triu(overlaps, 1) > _DUPLICATE).any(axis=0)
-        state = self._continued(boxes[single], moved, shares[single], frames, lasting)
+        state = self._continued(boxes[single], moved, shares[single], frames, lasting, variance)
         strong = lowest + state.strong_share() * spread
         # Where all scores are equal, rounding must not put them below the threshold.
         weak = min(lowest + WEAK * spread, strong) if len(recent) else -np.inf
@@ -95,14 +97,16 @@ class ScoreState(NamedTuple):
 
     def _continued(
         self,
-        found: Float[np.ndarray, "d 4"],
-        moved: Float[np.ndarray, "c 4"],
+        found: Float[np.ndarray, "d k"],
+        moved: Float[np.ndarray, "c k"],
         shares: Float[np.ndarray, " d"],
         frames: float,
         lasting: float,
+        variance: float,
     ) -> "ScoreState":
         """The chains after a frame whose detections have these shares of a sure score."""
-        overlaps = np.maximum(overlap(self.boxes, found), overlap(moved, found))
+        at_rest, in_motion = (overlap(boxes, found, variance) for boxes in (self.boxes, moved))
+        overlaps = np.maximum(at_rest, in_motion)
         rows = argmax_pairs(np.where(overlaps > _SAME, overlaps, 0.0))
         seen, free = rows >= 0, np.ones(len(found), bool)
         free[rows[seen]] = False

@@ -7,20 +7,24 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.tracking.camera import CameraState
+from mpfjax.vision.tracking.clutter import Clutter
 from mpfjax.vision.tracking.gaussian import Gaussian
 from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives
 from mpfjax.vision.tracking.noise import NoiseState
 from mpfjax.vision.tracking.scores import ScoreState
+from mpfjax.vision.tracking.vectors import Likeness
 
 
 class TrackerState(NamedTuple):
     """All that an `ObjectTracker` remembers, with a row for each object.
 
-    - `objects`: the moments of place and velocity, (m, 4) each.
+    - `objects`: the moments of place and velocity, (m, 4) each, or (m, 2) of points.
     - `lives`, `coasting`, `duplicates`: identities and counts; how long predictions are right;
       which are a second box of another one.
     - `scores`, `camera`, `noise`: what has been learned of the detector, the camera and the motion.
     - `colours`: (m, bins), the histograms of each object, all zero where it has none.
+    - `vectors`: (m, e), as the detector's; `likeness`: what has been learned of these.
+    - `clutter`: of points, how densely those of nobody lie.
     - `last_identity`: the highest ever given.
     - `full`: whether there was no room for a new object in the last frame.
     - `begun`: whether there was a frame on which the detector ran; `waited`: for how many frames it
@@ -38,6 +42,9 @@ class TrackerState(NamedTuple):
     camera: CameraState
     noise: NoiseState
     colours: Float[np.ndarray, "m bins"]
+    vectors: Float[np.ndarray, "m e"]
+    likeness: Likeness
+    clutter: Clutter
     last_identity: int
     full: bool
     begun: bool
@@ -50,7 +57,7 @@ class TrackerState(NamedTuple):
 class Tracks(NamedTuple):
     """The tracks in one frame, a row for each object.
 
-    - `boxes`: (m, 4), the mean box of each, centre and size in pixels.
+    - `boxes`: (m, 4), the mean box of each, centre and size in pixels; (m, 2), its mean point.
     - `identities`: (m,), a number that an object keeps for life.
     - `confirmed`: (m,), whether it has had enough detections to be taken for an object.
     - `unseen`: (m,), frames since its last detection.
@@ -65,7 +72,7 @@ class Tracks(NamedTuple):
     - `left_out`: how many detections of this frame could not be tracked.
     """
 
-    boxes: Float[Array | np.ndarray, "m 4"]
+    boxes: Float[Array | np.ndarray, "m k"]
     identities: Int[Array | np.ndarray, " m"]
     confirmed: Bool[Array | np.ndarray, " m"]
     unseen: Float[Array | np.ndarray, " m"]
@@ -78,6 +85,6 @@ class Tracks(NamedTuple):
     left_out: Int[np.ndarray, ""] | int = 0
 
     @property
-    def corner_boxes(self) -> Float[np.ndarray, "m 4"]:
-        """The boxes (x, y, w, h) with (x, y) the top-left corner, as files have them."""
+    def corner_boxes(self) -> Float[np.ndarray, "m k"]:
+        """The boxes (x, y, w, h) with (x, y) the top-left corner, as files have them; or points."""
         return top_left(np.asarray(self.boxes))

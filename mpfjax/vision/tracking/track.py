@@ -60,7 +60,9 @@ def track(
       or an iterable of these, one item for each frame, or a mapping from the numbers of frames to
       them; or an array of rows (frame, id, x, y, w, h, score) whose frames count from 1, or the
       path of a MOTChallenge file of these. None in the place of boxes, and a frame that a mapping
-      has not, says that the detector did not run, which is not "nothing there".
+      has not, says that the detector did not run, which is not "nothing there". For a tracker of
+      points they are (x, y), and rows (frame, id, x, y, score). `Detections` may hold vectors, such
+      as embeddings, by which look-alikes in motion are told apart.
     - `tracker`: None takes `ObjectTracker()`, with more room where a frame has more rows.
     - `key`: counts for nothing, since nothing is drawn.
     - `first`: the number of the first frame, by which rows are found. None is 1, and without
@@ -90,7 +92,8 @@ def track(
     on, with the number of the frame. Use it for recorded videos and for cameras.
     """
     del key
-    detector = as_detector(detections)
+    coordinates = 4 if tracker is None else tracker.coordinates
+    detector = as_detector(detections, coordinates)
     if frames is None and (callable(detector) or camera_motion == "pixels"):
         raise ValueError("frames: None; a detector, and camera_motion 'pixels', need them")
     if tracker is None:
@@ -105,9 +108,9 @@ def track(
     if camera_motion is None and stills is not None and use_colours and has_opencv():
         camera_motion = "pixels"
     flow = OpticalFlow() if camera_motion == "pixels" else None
-    found = observed(stills, detector, first)
-    times = iter(() if times is None else times)
-    seen = _seen(found, times, frame_size, min_score, room, use_colours, flow)
+    found = observed(stills, detector, first, coordinates)
+    times, deviation = iter(() if times is None else times), tracker.point_deviation
+    seen = _seen(found, times, frame_size, min_score, room, use_colours, flow, deviation)
     return _tracked(seen, tracker, ahead)
 
 
@@ -128,6 +131,7 @@ def _seen(
     room: int,
     use_colours: bool,
     flow: OpticalFlow | None,
+    deviation: float | None,
 ) -> Iterator[_Seen]:
     """What does not depend on earlier tracks, frame by frame."""
     once = Once()
@@ -137,7 +141,7 @@ def _seen(
         if detected is not None:
             if min_score is not None and len(detected.boxes) and detected.scores is None:
                 raise ValueError(f"min_score: {min_score}, and detections have no scores")
-            found = Found.of(detected, f"detections: frame {number}", size)
+            found = Found.of(detected, f"detections: frame {number}", size, deviation)
             if min_score is not None:
                 found = found.at(found.scores >= min_score)
             if len(found.rows) > room:
@@ -147,10 +151,11 @@ def _seen(
                     " there is room for, max_detections; the strongest are kept",
                 )
                 found = found.at(slice(room))
-            if use_colours and still is not None:
+            if use_colours and still is not None and deviation is None:
                 found = coloured(found, still)
         if flow is not None and still is not None:
-            motion = flow(still, None if found is None else top_left(found.boxes))
+            boxes = None if found is None or deviation else top_left(found.boxes)
+            motion = flow(still, boxes)
         yield _Seen(number, found, motion, next(times, None))
 
 
@@ -178,6 +183,7 @@ def online_rows(
 ) -> Float[np.ndarray, "k columns"]:
     """Rows (frame, id, x, y, w, h) of the objects that are shown in each frame (`Tracks.shown`).
 
+    Those of points are (frame, id, x, y).
     With `described` each has two more columns, the score of its latest detection and its class.
     """
     return _rows(number, tracks, tracks.shown, described)
@@ -204,7 +210,8 @@ def offline_rows(
         )
         for number, tracks in enumerate(kept, first)
     ]
-    return np.concatenate([np.zeros((0, 8 if described else 6)), *rows])
+    coordinates = kept[0].boxes.shape[1] if kept else 4
+    return np.concatenate([np.zeros((0, 2 + coordinates + 2 * described)), *rows])
 
 
 def _rows(number: int, tracks: Tracks, written: Any, described: bool) -> np.ndarray:

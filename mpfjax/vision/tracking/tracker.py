@@ -10,6 +10,7 @@ from mpfjax.checks import Checked, Count, Finite, Positive, checked
 from mpfjax.vision.colour.bins import HSVColours
 from mpfjax.vision.colour.histograms import sampled_histograms
 from mpfjax.vision.tracking.associate import (
+    TEMPERATURE,
     compatible,
     learned_colours,
     mahalanobis,
@@ -18,10 +19,12 @@ from mpfjax.vision.tracking.associate import (
     unlikeness,
 )
 from mpfjax.vision.tracking.camera import CameraState, jolted
+from mpfjax.vision.tracking.clutter import Clutter
 from mpfjax.vision.tracking.detections import FAULTS, Detections, Found
 from mpfjax.vision.tracking.gaussian import (
     CameraMotion,
     Gaussian,
+    along,
     boxes_of,
     overlap,
     shared,
@@ -32,6 +35,7 @@ from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives, Spans
 from mpfjax.vision.tracking.noise import NoiseState
 from mpfjax.vision.tracking.scores import STRONG, WEAK, ScoreState
 from mpfjax.vision.tracking.state import TrackerState, Tracks
+from mpfjax.vision.tracking.vectors import Likeness, cosine_distances
 
 _COLOURS, _BANDS = HSVColours(num_hues=8, num_saturations=4, num_values=6), 3
 # Of a weak detection, of an object that is not confirmed, and of one of another class.
@@ -41,6 +45,8 @@ _YIELDING = 0.01  # of the claim of an object that takes only what others leave
 _BIRTH_OVERLAP = 0.5  # with an object or a stronger detection: it is one more box of the same
 _SAME = 0.5  # least overlap of a prediction that was right with the detection
 _CONTACT = 0.12  # an overlap from which on objects would learn each other's colours
+# Log odds that a point is an object's and not of nobody, to what confirms one; of a missing point.
+_POINT_ODDS, _MISSED = -np.log(10) - 3.0, -2.0
 _FIRST = 3  # strong detections of an object after which it teaches the noises
 
 
@@ -59,12 +65,17 @@ class ObjectTracker(Checked):
       begin new ones;
     - the detector's errors and the noises of the motion are learned from the innovations.
 
-    Lengths are in boxes, so that nothing depends on the size of the frame or of the objects.
+    Lengths are in boxes, so that nothing depends on the size of the frame or of the objects; with
+    `point_deviation` in deviations of points. Who has which point is told by distance alone, and
+    by how densely points of nobody lie, which is learned; two that begin nearer than 3.5 deviations
+    are one until they part. Vectors beside boxes count by what their cosine distances have told.
 
     - `max_objects`: M, how many objects there is room for.
     - `frames_per_second`: of the video.
     - `lost_seconds`: an object ends after so long without a detection. None takes a second, and
       eight frames where these are longer.
+    - `point_deviation`: detections are points (x, y) with an error of this deviation along each,
+      and no boxes: plots of a radar, keypoints, animals seen from above.
     - `scores`: "rank" finds from which score on a detection is strong, and starts an object, on any
       scale. "as_given" takes scores for probabilities: strong from .5 on, and below .2 a detection
       counts for nothing. "ignore" takes all for strong.
@@ -80,6 +91,7 @@ class ObjectTracker(Checked):
     max_objects: Count = eqx.field(static=True, default=24)
     frames_per_second: Positive | None = eqx.field(static=True, default=None, kw_only=True)
     lost_seconds: Positive | None = eqx.field(static=True, default=None, kw_only=True)
+    point_deviation: Positive | None = eqx.field(static=True, default=None, kw_only=True)
     scores: Literal["rank", "as_given", "ignore"] = eqx.field(
         static=True, default="rank", kw_only=True
     )
@@ -90,18 +102,26 @@ class ObjectTracker(Checked):
         """Frames a second, 25 where nobody says."""
         return 25.0 if self.frames_per_second is None else float(self.frames_per_second)
 
+    @property
+    def coordinates(self) -> int:
+        """Of a detection: four of a box, two of a point."""
+        return 4 if self.point_deviation is None else 2
+
     def init(self) -> TrackerState:
         """The state before the first frame: no objects."""
         none = np.zeros(0, int)
         return TrackerState(
-            objects=Gaussian.none(),
+            objects=Gaussian.none(self.coordinates),
             lives=Lives.begun(none, none, at_once=False),
             coasting=Coasting.initial(),
             duplicates=Duplicates.initial(),
-            scores=ScoreState.initial(),
+            scores=ScoreState.initial(self.coordinates),
             camera=CameraState.initial(),
-            noise=NoiseState.initial(self.rate),
+            noise=NoiseState.initial(self.rate, self.coordinates),
             colours=np.zeros((0, _BANDS * _COLOURS.num_bins)),
+            vectors=np.zeros((0, 0)),
+            likeness=Likeness.initial(),
+            clutter=Clutter.initial(),
             last_identity=0,
             full=False,
             begun=False,
@@ -125,10 +145,11 @@ class ObjectTracker(Checked):
     ) -> tuple[TrackerState, Tracks]:
         """The state after a frame and its detections, and the tracks in it.
 
-        `detections` are what a detector of `track` gives: boxes, (boxes, scores), or (boxes,
-        scores, classes); None where it did not run, which is not "nothing there". Those that cannot
-        be tracked are left out as by `track`, and counted in the state. Where `frame` is None they
-        are tracked alone, without colours. Nothing is drawn: the key may be None.
+        `detections` are what a detector of `track` gives: boxes, (boxes, scores), (boxes, scores,
+        classes), or `Detections`; with `point_deviation` points in the place of boxes; None where
+        it did not run, which is not "nothing there". Those that cannot be tracked are left out as
+        by `track`, and counted in the state. Where `frame` is None they are tracked alone, without
+        colours. Nothing is drawn: the key may be None.
 
         - `motion`: what `OpticalFlow` makes of the frames; None leaves it to the detections.
         - `time`: in seconds, for frames that are not equally far apart; None takes the frame after
@@ -143,8 +164,9 @@ class ObjectTracker(Checked):
         if detections is not None:
             named = f"detections: frame {state.number + 1}"
             size = frame_size if frame is None else np.shape(frame)[:2]
-            found = Found.of(Detections.of(detections, named), named, size)
-            if frame is not None:
+            given = Detections.of(detections, named, self.coordinates)
+            found = Found.of(given, named, size, self.point_deviation)
+            if frame is not None and self.point_deviation is None:
                 found = coloured(found, frame)
         return advanced(self, state, found, motion, time)
 
@@ -188,11 +210,16 @@ def advanced(
         frames = (time - before) * tracker.rate
     if time is None and before is not None:
         time = before + 1 / tracker.rate
+    if motion is not None and tracker.point_deviation is not None:
+        motion = motion._replace(shift=motion.shift / tracker.point_deviation)
     state, gone, chains = _carried(state, motion, frames)
     frames += state.waited
     state = state._replace(number=state.number + 1, time=time, waited=frames)
     if found is None:
-        return _unseen(state, chains)
+        # Objects move on, and nothing is held against them.
+        state = state._replace(scores=state.scores._replace(boxes=chains), full=False)
+        none = np.zeros(len(state.lives.seen))
+        return state, _tracks(tracker, state, none.astype(int) - 1, none, 0)
     found.warn_of_first(state.left_out)
     given = found.scores
     if tracker.scores == "ignore":
@@ -200,19 +227,34 @@ def advanced(
     if not tracker.class_matters:
         found = found._replace(classes=np.zeros_like(found.classes))
     spans, lives = Spans.at(tracker.rate, tracker.lost_seconds), state.lives
-    places, unlike = found.places, _unlikeness(tracker, state, found)
+    places, unlike, distances = found.places, _unlikeness(tracker, state, found), np.zeros((0, 0))
+    if found.vectors is not None:
+        state = _with_vectors(state, found.vectors.shape[1])
+        distances = cosine_distances(state.vectors, found.vectors)
+        unlike = unlike + state.likeness.cost(distances)
     doubles = overlap(found.boxes, found.boxes)
     doubles[~_may_be_one(tracker, found.classes, found.classes)] = 0.0
-    state, shift = _with_camera(state, found, places, unlike, motion, gone)
-    chains = chains + np.append(shift, [0, 0])
-    scores = state.scores.after(found.boxes, found.scores, doubles, chains, frames, spans.lasting)
+    others, variance, temperature, gained = 0.0, 2.0, TEMPERATURE, 0.0
+    if tracker.point_deviation is None:
+        state, shift = _with_camera(state, found, places, unlike, motion, gone)
+        chains = chains + along(chains, shift)
+    else:
+        others, temperature = state.clutter.cost, 1.0  # distance is the only cue
+        variance += float(np.mean(state.noise.noises.speed**2))
+    scores = state.scores.after(
+        found.boxes, found.scores, doubles, chains, frames, spans.lasting, variance
+    )
     if tracker.scores == "as_given":
         scores = scores._replace(weak=WEAK, strong=STRONG)
     strong = found.scores >= scores.strong
 
     predicted, noises = state.objects, state.noise.noises
-    cost = mahalanobis(predicted, noises.errors, places, unlike)
-    source, probability = _associated(state, cost, strong, found.scores >= scores.weak)
+    cost = mahalanobis(predicted, noises.errors, places, unlike, others=others)
+    counts = found.scores >= scores.weak
+    source, probability = _associated(state, cost, strong, counts, temperature)
+    if tracker.point_deviation is not None:
+        gains = np.append(-0.5 * cost, np.full((len(cost), 1), _MISSED), axis=1)
+        gained = gains[np.arange(len(cost)), source]
     taken, rows = _Taken.of(source, strong), np.flatnonzero(source >= 0)
     before, place = predicted.at(rows), places[source[rows]]
     wider = np.where(taken.strong[rows], 1.0, WEAK_ERROR)[:, None]
@@ -221,7 +263,8 @@ def advanced(
     objects.put(rows, updated.mixed_with(before, probability[rows, None]))
 
     coast = state.coasting.longest(spans)
-    counted, stays = lives.counted(taken.there, taken.strong, frames, spans, coast, state.full)
+    told = taken.there, taken.strong, frames, spans, coast, state.full
+    counted, stays = lives.counted(*told, gained)
     stays &= within(boxes_of(objects.place), found.extent, centred=~taken.there)
     right = taken.there.copy()
     right[rows] = shared(boxes_of(before.place), found.boxes[source[rows]]) >= _SAME
@@ -241,7 +284,9 @@ def advanced(
     start = Gaussian.begun(places[born], unit * noises.errors, unit * speed)
     objects = objects.at(stays).joined(start)
     names = state.last_identity + 1 + np.arange(len(born))
-    begun = Lives.begun(names, found.classes[born], at_once=not state.begun)
+    is_boxes = tracker.point_deviation is None
+    at_once, odds = is_boxes and not state.begun, 0.0 if is_boxes else _POINT_ODDS
+    begun = Lives.begun(names, found.classes[born], at_once, odds)
     taken = _Taken.of(np.append(source[stays], born), strong)
     told = taken.values(found.classes, 0), taken.values(given, 0.0)
     lives = counted.at(stays).joined(begun).described(taken.there, *told)
@@ -251,36 +296,41 @@ def advanced(
     overlaps[~_may_be_one(tracker, lives.classes, lives.classes)] = 0.0
     duplicates = state.duplicates.after(lives.identities, stays, taken.there, overlaps)
     lives = lives._replace(shown=lives.shown & ~duplicates.doubtful)
-    colours = np.append(state.colours[stays], np.zeros((len(born), state.colours.shape[1])), axis=0)
+    colours, vectors = (
+        np.append(known[stays], np.zeros((len(born), known.shape[1])), axis=0)
+        for known in (state.colours, state.vectors)
+    )
+    alone = np.sum(overlaps > _CONTACT, axis=1) <= 1  # each overlaps itself
     if found.colours is not None:
-        alone = np.sum(overlaps > _CONTACT, axis=1) <= 1  # each overlaps itself
         colours = learned_colours(colours, taken.values(found.colours, 0.0), alone)
+    likeness, clutter = state.likeness, state.clutter
+    if found.vectors is not None:
+        vectors = learned_colours(vectors, taken.values(found.vectors, 0.0), alone)
+        likeness = likeness.after(distances, source[:, None] == np.arange(len(places)))
+    if not is_boxes:
+        clutter = clutter.after(places, len(places) - len(rows) if state.begun else 0)
     state = TrackerState(
         objects, lives, coasting, duplicates, scores, state.camera,
-        noise._replace(moments=moments), colours,
+        noise._replace(moments=moments), colours, vectors, likeness, clutter,
         last_identity=state.last_identity + len(born), full=bool(np.sum(wanted) > len(born)),
         begun=True, waited=0.0, time=time, number=state.number,
         left_out=state.left_out + found.left_out,
     )  # fmt: skip
     probability = np.append(probability[stays], np.ones(len(born)))
     left_out = int(found.left_out.sum())
-    return state, _tracks(state, taken.values(found.rows, -1), probability, left_out)
-
-
-def _unseen(state: TrackerState, chains: np.ndarray) -> tuple[TrackerState, Tracks]:
-    """A frame on which no detector ran: objects move on, and nothing is held against them."""
-    scores = state.scores._replace(boxes=chains)
-    state = state._replace(scores=scores, full=False)
-    none = np.zeros(len(state.lives.seen))
-    return state, _tracks(state, none.astype(int) - 1, none, 0)
+    return state, _tracks(tracker, state, taken.values(found.rows, -1), probability, left_out)
 
 
 def _tracks(
-    state: TrackerState, rows: np.ndarray, probability: np.ndarray, left_out: int
+    tracker: ObjectTracker,
+    state: TrackerState,
+    rows: np.ndarray,
+    probability: np.ndarray,
+    left_out: int,
 ) -> Tracks:
     lives = state.lives
     told = lives.identities, lives.confirmed, lives.unseen, state.full, lives.shown
-    boxes = boxes_of(state.objects.place)
+    boxes = boxes_of(state.objects.place) * (tracker.point_deviation or 1.0)
     return Tracks(boxes, *told, rows, probability, lives.classes, lives.scores, left_out)
 
 
@@ -300,9 +350,17 @@ def _unlikeness(
     return cost if found.colours is None else cost + unlikeness(found.colours, state.colours)
 
 
+def _with_vectors(state: TrackerState, size: int) -> TrackerState:
+    """With room for vectors of this size, where there were none so far."""
+    held = state.vectors
+    if held.shape[1] not in (0, size):
+        raise ValueError(f"detections: vectors of {size} numbers; there were {held.shape[1]}")
+    return state if held.shape[1] else state._replace(vectors=np.zeros((len(held), size)))
+
+
 def _carried(
     state: TrackerState, motion: CameraMotion | None, frames: float
-) -> tuple[TrackerState, Float[np.ndarray, "m 2"], Float[np.ndarray, "c 4"]]:
+) -> tuple[TrackerState, Float[np.ndarray, "m 2"], Float[np.ndarray, "c k"]]:
     """All so many frames later, and moved with the picture.
 
     Also by how far the picture moves the objects, and the boxes of the chains.
@@ -350,6 +408,7 @@ def _associated(
     cost: Float[np.ndarray, "m d"],
     strong: Bool[np.ndarray, " d"],
     counts: Bool[np.ndarray, " d"],
+    temperature: float,
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """The detection of each object, -1 for none, and the probability that it is its own."""
     cost = cost + np.where(strong, 0.0, _WEAK_COST)
@@ -359,7 +418,7 @@ def _associated(
     cost = np.where(possible, cost, np.inf)
     source = one_to_one(cost)
     rows, probability = np.flatnonzero(source >= 0), np.zeros(len(source))
-    probability[rows] = probabilities(cost)[rows, source[rows]]
+    probability[rows] = probabilities(cost, temperature)[rows, source[rows]]
     return source, probability
 
 

@@ -1,0 +1,145 @@
+"""Points in the place of boxes, and vectors beside boxes, on simulations whose truth is known."""
+
+import numpy as np
+import pytest
+
+from mpfjax.vision import Detections, ObjectTracker, track
+from mpfjax.vision.tracking.track import online_rows
+from mpfjax.vision.tracking.vectors import Likeness, cosine_distances
+
+SIGMA = 2.0
+
+
+def kalman(plots, noises, speed):
+    """The positions of a Kalman filter with a nearly constant velocity, by matrices, along x."""
+    F, H = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+    m, P, means = np.array([plots[0], 0.0]), np.diag([SIGMA**2, speed**2]), [plots[0]]
+    for plot, (place, velocity) in zip(plots[1:], noises, strict=True):
+        m, P = F @ m, F @ P @ F.T + np.diag([place**2, velocity**2])
+        gain = P @ H.T / (H @ P @ H.T + SIGMA**2)
+        m, P = m + (gain * (plot - H @ m)).ravel(), P - gain @ H @ P
+        means.append(m[0])
+    return np.array(means)
+
+
+def test_two_points_far_apart_are_followed_by_a_kalman_filter_each():
+    rng = np.random.default_rng(0)
+    t = np.arange(30)[:, None, None]
+    truth = np.array([[0.0, 0.0], [9000.0, 5000.0]]) + t * np.array([[6.0, -2.0], [-5.0, 3.0]])
+    plots = truth + SIGMA * rng.standard_normal(truth.shape)
+    tracker = ObjectTracker(4, point_deviation=SIGMA)
+    state, means, noises = tracker.init(), [], []
+    for now in plots:
+        noises.append(state.noise.noises)
+        state, tracks = tracker.step(None, state, None, now)
+        assert tracks.identities.tolist() == [1, 2]
+        means.append(tracks.boxes)
+    for k in range(2):
+        used = [SIGMA * np.array([each.place[k], each.velocity[k]]) for each in noises[1:]]
+        for j in range(2):
+            expected = kalman(plots[:, j, k], used, SIGMA * noises[0].speed[k])
+            np.testing.assert_allclose(np.array(means)[:, j, k], expected, atol=0.02 * SIGMA)
+    errors = np.array(means)[10:] - truth[10:]
+    assert np.sqrt(np.mean(errors**2)) < 0.8 * SIGMA
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_points_among_false_ones_in_any_unit(scale):
+    """Nine in ten plots, three false ones a scan, targets that turn at random; at one a second."""
+    rng = np.random.default_rng(1)
+    place, velocity = rng.uniform(0, 1000, (5, 2)), rng.uniform(-8, 8, (5, 2))
+    rows, truth = [], []
+    for number in range(1, 61):
+        velocity = velocity + 0.3 * rng.standard_normal((5, 2))
+        place = place + velocity
+        truth.append(place)
+        seen = place[rng.uniform(size=5) < 0.9]
+        plots = seen + 5 * rng.standard_normal(seen.shape)
+        plots = np.concatenate([plots, rng.uniform(-200, 1200, (rng.poisson(3), 2))])
+        rows += [[number, -1, *plot, 1.0] for plot in scale * plots]
+    tracker = ObjectTracker(40, frames_per_second=1, point_deviation=5 * scale)
+    followed, false = np.zeros((60, 5), int), 0
+    for number, tracks in enumerate(track(None, np.array(rows), tracker)):
+        table = online_rows(number + 1, tracks, described=True)
+        assert table.shape[1] == 6
+        points = table[:, 2:4] / scale
+        apart = np.linalg.norm(truth[number][:, None] - points, axis=2)
+        near = apart.min(axis=1, initial=np.inf) < 20
+        followed[number, near] = table[apart.argmin(axis=1)[near], 1]
+        false += int((apart.min(axis=0, initial=np.inf) > 20).sum())
+    late = followed[10:]
+    assert (late > 0).mean() > 0.85
+    switches = sum((np.diff(each[each > 0]) != 0).sum() for each in late.T)
+    assert switches <= 3
+    assert false / 60 < 1
+
+
+def test_what_points_are_is_said_in_errors():
+    tracker = ObjectTracker(4, point_deviation=1.0)
+    with pytest.raises(ValueError, match="detections: frame 1"):
+        tracker.step(None, tracker.init(), None, np.zeros((3, 4)))
+    with pytest.raises(ValueError, match=r"frame,id,x,y,score"):
+        next(track(None, np.ones((3, 9)), tracker))
+
+
+def right_after_a_meeting(crosses, with_vectors, seed):
+    """Whether two who walk up to each other and stand together keep their identities after it.
+
+    They walk on, or turn back: their motion does not say which, and vectors do.
+    """
+    rng = np.random.default_rng(seed)
+    codes, kept = rng.standard_normal((2, 8)), []
+    end = np.linspace(99, 198, 34) if crosses else np.linspace(99, 0, 34)
+    tracker = ObjectTracker(4, frames_per_second=25)
+    state = tracker.init()
+    for x in np.concatenate([np.linspace(0, 99, 34), np.full(25, 99.0), end]):
+        corners = np.array([[x, 50.0], [200 - x, 52.0]]) + 0.5 * rng.standard_normal((2, 2))
+        boxes = np.c_[corners, np.tile([20.0, 40.0], (2, 1))]
+        seen, order = codes + 0.5 * rng.standard_normal((2, 8)), rng.permutation(2)
+        given = Detections(boxes[order], vectors=seen[order] if with_vectors else None)
+        state, tracks = tracker.step(None, state, None, given)
+        kept.append(dict(zip(order[tracks.detections], tracks.identities, strict=True)))
+    return kept[20] == kept[-1]
+
+
+@pytest.mark.parametrize("with_vectors", [False, True])
+def test_look_alikes_in_motion_are_told_apart_by_their_vectors(with_vectors):
+    kept = [right_after_a_meeting(way, with_vectors, seed) for way in (0, 1) for seed in range(4)]
+    assert all(kept) == with_vectors
+
+
+def test_an_identity_is_regained_after_a_long_cover():
+    """Walkers behind a wall for three seconds, by their motion; 5% of speed changes at random."""
+    rng = np.random.default_rng(3)
+    place = np.c_[[0.0, 10, 560, 570], [30.0, 120, 70, 190]]
+    speed, kept = np.array([2.5, 3.0, -2.5, -3.0]), {}
+    tracker = ObjectTracker(8, frames_per_second=25, lost_seconds=5)
+    state, hidden = tracker.init(), 0
+    for _ in range(200):
+        speed = speed * (1 + 0.005 * rng.standard_normal(4))
+        place[:, 0] += speed
+        out = np.flatnonzero((place[:, 0] < 180) | (place[:, 0] > 390))
+        boxes = np.c_[
+            place[out] + 0.5 * rng.standard_normal((len(out), 2)), np.tile([20, 40], (len(out), 1))
+        ]
+        hidden += 4 - len(out)
+        state, tracks = tracker.step(None, state, None, boxes)
+        for row, name in zip(tracks.detections, tracks.identities, strict=True):
+            if row >= 0:
+                kept.setdefault(int(out[row]), []).append(int(name))
+    assert hidden > 4 * 60
+    assert all(len(set(names)) == 1 for names in kept.values())
+
+
+def test_the_weight_of_vectors_is_the_odds_of_their_distances():
+    rng = np.random.default_rng(0)
+    distances = np.stack([rng.normal(0.2, 0.1, 500), rng.normal(0.8, 0.1, 500)], axis=1)
+    same = np.tile([True, False], (500, 1))
+    cost = Likeness.initial().after(distances, same).cost(np.array([[0.5, 0.45, np.nan, 9.0]]))
+    # -2 log of the odds of N(.2, .1²) to N(.8, .1²), with .001 added to the variance
+    np.testing.assert_allclose(cost[0, 1], -2 * 0.6 / 0.011 * 0.05, rtol=0.1)
+    np.testing.assert_allclose(cost[0, [0, 2, 3]], [0, 0, 8], atol=1.0)
+    alike = Likeness.initial().after(distances, ~same & False).cost(distances)
+    np.testing.assert_array_equal(alike, 0 * distances)
+    unknown = cosine_distances(np.array([[0.0, 0.0], [3.0, 4.0]]), np.array([[6.0, 8.0]]))
+    np.testing.assert_allclose(unknown, [[np.nan], [0]], atol=1e-12)
