@@ -135,11 +135,11 @@ def test_the_weight_of_vectors_is_the_odds_of_their_distances():
     rng = np.random.default_rng(0)
     distances = np.stack([rng.normal(0.2, 0.1, 500), rng.normal(0.8, 0.1, 500)], axis=1)
     same = np.tile([True, False], (500, 1))
-    cost = Likeness.initial().after(distances, same).cost(np.array([[0.5, 0.45, np.nan, 9.0]]))
+    cost = Likeness().after(distances, same).cost(np.array([[0.5, 0.45, np.nan, 9.0]]))
     # -2 log of the odds of N(.2, .1²) to N(.8, .1²), with .001 added to the variance
     np.testing.assert_allclose(cost[0, 1], -2 * 0.6 / 0.011 * 0.05, rtol=0.1)
     np.testing.assert_allclose(cost[0, [0, 2, 3]], [0, 0, 8], atol=1.0)
-    alike = Likeness.initial().after(distances, ~same & False).cost(distances)
+    alike = Likeness().after(distances, ~same & False).cost(distances)
     np.testing.assert_array_equal(alike, 0 * distances)
     unknown = cosine_distances(np.array([[0.0, 0.0], [3.0, 4.0]]), np.array([[6.0, 8.0]]))
     np.testing.assert_allclose(unknown, [[np.nan], [0]], atol=1e-12)

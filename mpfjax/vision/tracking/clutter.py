@@ -17,15 +17,10 @@ class Clutter(NamedTuple):
     - `number`: of points of nobody, in so many `frames`; one in one frame before any.
     """
 
-    low: Float[np.ndarray, "2"]
-    high: Float[np.ndarray, "2"]
-    number: float
-    frames: float
-
-    @classmethod
-    def initial(cls) -> "Clutter":
-        """Before any point."""
-        return cls(np.full(2, np.inf), np.full(2, -np.inf), 1.0, 1.0)
+    low: Float[np.ndarray, "2"] = np.full(2, np.inf)
+    high: Float[np.ndarray, "2"] = np.full(2, -np.inf)
+    number: float = 1.0
+    frames: float = 1.0
 
     def after(self, points: Float[np.ndarray, "d 2"], number: int) -> "Clutter":
         """With a frame's points, so many of them of nobody."""

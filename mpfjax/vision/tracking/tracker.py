@@ -120,8 +120,8 @@ class ObjectTracker(Checked):
             noise=NoiseState.initial(self.rate, self.coordinates),
             colours=np.zeros((0, _BANDS * _COLOURS.num_bins)),
             vectors=np.zeros((0, 0)),
-            likeness=Likeness.initial(),
-            clutter=Clutter.initial(),
+            likeness=Likeness(),
+            clutter=Clutter(),
             last_identity=0,
             full=False,
             begun=False,
@@ -285,8 +285,9 @@ def advanced(
     objects = objects.at(stays).joined(start)
     names = state.last_identity + 1 + np.arange(len(born))
     is_boxes = tracker.point_deviation is None
-    at_once, odds = is_boxes and not state.begun, 0.0 if is_boxes else _POINT_ODDS
-    begun = Lives.begun(names, found.classes[born], at_once, odds)
+    begun = Lives.begun(names, found.classes[born], at_once=is_boxes and not state.begun)
+    if not is_boxes:
+        begun = begun._replace(odds=begun.odds + _POINT_ODDS)
     taken = _Taken.of(np.append(source[stays], born), strong)
     told = taken.values(found.classes, 0), taken.values(given, 0.0)
     lives = counted.at(stays).joined(begun).described(taken.there, *told)

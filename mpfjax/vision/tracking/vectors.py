@@ -15,17 +15,12 @@ class Likeness(NamedTuple):
     """Cosine distances of objects' vectors to those of their detections, and of others.
 
     - `number`, `total`, `squares`: (2,), how many there were, their sum, and that of their squares;
-      to the same object's first.
+      to the same object's first. Without any, vectors tell nothing.
     """
 
-    number: Float[np.ndarray, "2"]
-    total: Float[np.ndarray, "2"]
-    squares: Float[np.ndarray, "2"]
-
-    @classmethod
-    def initial(cls) -> "Likeness":
-        """Nothing is known, and vectors tell nothing."""
-        return cls(np.zeros(2), np.zeros(2), np.zeros(2))
+    number: Float[np.ndarray, "2"] = np.zeros(2)
+    total: Float[np.ndarray, "2"] = np.zeros(2)
+    squares: Float[np.ndarray, "2"] = np.zeros(2)
 
     def cost(self, distances: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
         """-2 log of the odds that a pair at this distance is of the same object, beside motion.
