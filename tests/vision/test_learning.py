@@ -102,7 +102,7 @@ def test_each_candidate_is_a_filter_of_its_own_from_the_first_detection_on():
     rng = np.random.default_rng(0)
     seen = np.array([30.0, 60, 3, 3.5]) + np.arange(9)[:, None] * [1, 2, 0.09, 0.08]
     seen += rng.normal(0, 0.05, seen.shape) * [2, 2, 1, 1]
-    speed, nobody = np.array([0.1, 0.05, 0.05, 0.03]), Gaussian.none()
+    speed, nobody = np.array([0.1, 0.05, 0.05, 0.03]), Gaussian.none(4)
     state = NoiseState.initial(25.0)
     state = state._replace(moments=state.begun(seen[:1], speed))
     alone = [

@@ -62,6 +62,8 @@ def test_points_among_false_ones_in_any_unit(scale):
     for number, tracks in enumerate(track(None, np.array(rows), tracker)):
         table = online_rows(number + 1, tracks, described=True)
         assert table.shape[1] == 6
+        if not len(table):
+            continue
         points = table[:, 2:4] / scale
         apart = np.linalg.norm(truth[number][:, None] - points, axis=2)
         near = apart.min(axis=1, initial=np.inf) < 20

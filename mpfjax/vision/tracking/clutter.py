@@ -13,22 +13,22 @@ _MARGIN = 6.0  # around all points, in deviations of their errors
 class Clutter(NamedTuple):
     """Points without an object, and the area that they come from, in deviations of their errors.
 
-    - `low`, `high`: (2,), the corners of all points so far.
+    - `corners`: (2, 2), the lowest and the highest of all points so far; none before any.
     - `number`: of points of nobody, in so many `frames`; one in one frame before any.
     """
 
-    low: Float[np.ndarray, "2"] = np.full(2, np.inf)
-    high: Float[np.ndarray, "2"] = np.full(2, -np.inf)
+    corners: Float[np.ndarray, "c 2"] = np.zeros((0, 2))
     number: float = 1.0
     frames: float = 1.0
 
     def after(self, points: Float[np.ndarray, "d 2"], number: int) -> "Clutter":
         """With a frame's points, so many of them of nobody."""
-        low, high = np.min([self.low, *points], axis=0), np.max([self.high, *points], axis=0)
-        return Clutter(low, high, KEPT * self.number + number, KEPT * self.frames + 1)
+        told = np.concatenate([self.corners, points])
+        corners = np.array([told.min(axis=0), told.max(axis=0)]) if len(told) else told
+        return Clutter(corners, KEPT * self.number + number, KEPT * self.frames + 1)
 
     @property
     def cost(self) -> float:
         """2 log(2π λ), λ the density: what takes a pair's cost to that of a point of nobody."""
-        sides = np.maximum(self.high - self.low, 0.0) + 2 * _MARGIN
+        sides = np.sum(np.diff(self.corners, axis=0), axis=0) + 2 * _MARGIN
         return 2 * float(np.log(2 * np.pi * self.number / self.frames / np.prod(sides)))

@@ -50,8 +50,9 @@ class Lives(NamedTuple):
     - `identities`: (m,); `classes`: (m,), 0 for none; `scores`: (m,), of the latest detection.
     - `seen`: (m,), in how many frames it had a strong detection.
     - `unseen`, `unsure`: (m,), for how many frames it has had no detection, and no strong one.
-    - `confirmed`: (m,), whether it has had enough; `odds`: (m,), in logarithms, that its points are
-      not of nobody, to those that confirm one, and 0 of boxes; `shown`: (m,), whether it should be shown.
+    - `confirmed`: (m,), whether it has had enough; `shown`: (m,), whether it should be shown.
+    - `odds`: (m,), in logarithms, that its points are not of nobody, to those that confirm it; 0 of
+      boxes.
     """
 
     identities: Int[np.ndarray, " m"]
@@ -106,8 +107,8 @@ class Lives(NamedTuple):
 
         An object ends if it has had no detection for longer than the patience, or for more than one
         frame while it is not confirmed. It is confirmed after two frames with strong detections
-        where its odds are for it, or at once in the first frame. Where there is no room, an unconfirmed one ends in its first
-        frame without a detection, and one that was confirmed at once and has had no strong
+        where its odds are for it, or at once in the first frame. Where there is no room, an
+        unconfirmed one ends in its first frame without a detection, and one that was confirmed at once and has had no strong
         detections since ends as soon as it is no longer shown: after `coast` frames without a
         detection, or three tenths of a second without a strong one.
         """
