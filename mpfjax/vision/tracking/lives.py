@@ -108,9 +108,9 @@ class Lives(NamedTuple):
         An object ends if it has had no detection for longer than the patience, or for more than one
         frame while it is not confirmed. It is confirmed after two frames with strong detections
         where its odds are for it, or at once in the first frame. Where there is no room, an
-        unconfirmed one ends in its first frame without a detection, and one that was confirmed at once and has had no strong
-        detections since ends as soon as it is no longer shown: after `coast` frames without a
-        detection, or three tenths of a second without a strong one.
+        unconfirmed one ends in its first frame without a detection, and one that was confirmed at
+        once and has had no strong detections since ends as soon as it is no longer shown: after
+        `coast` frames without a detection, or three tenths of a second without a strong one.
         """
         seen = self.seen + strong
         unseen = np.where(detected, 0.0, self.unseen + frames)
