@@ -302,7 +302,7 @@ class BeamModel(AbstractLaser):
     beams that met nothing. `AbstractLaser` says what its other parameters are.
 
     Use it where several places have walls at the same distances, but in other directions, or behind
-    other walls; with a map that is `tabulated` it takes about as long as `LikelihoodField`.
+    other walls, with a map that is `tabulated`: it takes no longer than `LikelihoodField` then.
     """
 
     z_short: Weight = eqx.field(kw_only=True, converter=to_array("z_short"), default=0.005)

@@ -169,7 +169,8 @@ def _warn_of_derivative(model: Any, observation: PyTree, states: PyTree, where: 
     try:
         slopes = with_floats_traced(lambda own: _derivative(own, observation, states), model)
     except (TypeError, ValueError, NotImplementedError):
-        # A filter needs no derivative; who asks for one of such a model is told by JAX itself.
+        # JAX has no derivative of it, as of a while loop in reverse (ValueError), of whole numbers
+        # (TypeError) or of a call to the host (NotImplementedError). A filter needs none.
         return
     if any(np.isnan(slope).any() for slope in jax.tree.leaves(slopes)):
         said = f"{model_name(model)}.log_likelihood has a derivative of NaN{where}"

@@ -252,7 +252,7 @@ def test_public_map(data):
     """TurtleBot3's world, most of which is unknown."""
     path = data / "maps" / "turtlebot3_world.pgm"
     if not path.is_file():
-        pytest.skip(f"no {path}")
+        pytest.skip(f"no {path}: a folder of sequences need not have the public map")
     grid = robots.read_map(path, resolution=0.05)
     assert grid.occupied.shape == (384, 384)
     assert 0 < grid.occupied.sum() < grid.free.sum() < (~grid.free & ~grid.occupied).sum()
