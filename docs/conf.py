@@ -29,7 +29,8 @@ nitpick_ignore_regex = [
     ("py:class", r"mpfjax\.(moves\.conditional|running\.(late|long_runs))\.\w+"),
     ("py:class", r"mpfjax\.moves\.resampling\.(line|ancestors)\.\w+"),
     ("py:class", r"mpfjax\.vision\.colour\.(bins|histograms)\.\w+"),
-    ("py:class", r"mpfjax\.vision\.tracking\.(camera|clutter|gaussian|lives|noise|scores|vectors)\.\w+"),
+    ("py:class", r"mpfjax\.vision\.tracking\.(camera|clutter|gaussian|lives)\.\w+"),
+    ("py:class", r"mpfjax\.vision\.tracking\.(noise|scores|vectors)\.\w+"),
 ]
 
 html_theme = "furo"
