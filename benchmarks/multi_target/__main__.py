@@ -131,7 +131,7 @@ def _scores(scene: Scene, found: Found, truth: np.ndarray) -> tuple[float, float
     def of_step(places: Any, truths: Any, is_told: Any, is_there: Any) -> Any:
         given = {"cutoff": scene.cutoff, "estimate_mask": is_told, "truth_mask": is_there}
         if scene.order == 1:
-            return mpfjax.metrics.ospa(places, truths, order=1.0, **given)
+            return mpfjax.metrics.ospa(places, truths, exponent=1.0, **given).distance
         return mpfjax.metrics.gospa(places, truths, **given).distance
 
     places, there = np.float32(found.places), np.float32(there)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.checks import Positive, check_shape, checked, number, real_array
 
-Order = Annotated[float, number(lambda p: 1 <= p < np.inf, "a finite number of at least 1")]
+Exponent = Annotated[float, number(lambda p: 1 <= p < np.inf, "a finite number of at least 1")]
 Alpha = Annotated[float, number(lambda alpha: 0 < alpha <= 2, "a number in (0, 2]")]
 
 
@@ -26,13 +26,26 @@ def _assign(costs: Float[Array, "a b"]) -> tuple[Array, Array]:
     return hungarian_algorithm(costs)
 
 
-class GOSPA(NamedTuple):
-    """The result of `gospa`: distance^order = localisation + missed + false.
+class OSPA(NamedTuple):
+    """The result of `ospa`: distance^exponent = localisation + cardinality, a mean per object.
 
     - `distance`: the metric itself, in the unit of the base distance.
-    - `localisation`: the sum of d^order over the estimates paired with an object.
+    - `localisation`: the sum of min(d, cutoff)^exponent over the pairs, by the larger number n.
+    - `cardinality`: cutoff^exponent times the share of these n that have no partner.
+    """
+
+    distance: Float[Array, ""]
+    localisation: Float[Array, ""]
+    cardinality: Float[Array, ""]
+
+
+class GOSPA(NamedTuple):
+    """The result of `gospa`: distance^exponent = localisation + missed + false.
+
+    - `distance`: the metric itself, in the unit of the base distance.
+    - `localisation`: the sum of d^exponent over the estimates paired with an object.
     - `missed`: the cost of the objects without an estimate; where alpha is 2, it is their number
-      times cutoff^order / 2.
+      times cutoff^exponent / 2.
     - `false`: the cost of the estimates without an object, in the same way.
     """
 
@@ -54,17 +67,17 @@ class _Pairing(NamedTuple):
         """Which entries have both; the others are alone, or nothing at all."""
         return self.is_estimate & self.is_truth
 
-    def distance(self, order: float, cost_alone: float) -> Float[Array, ""]:
-        """(Σ d^order + cost_alone times the number alone)^(1 / order)."""
+    def distance(self, exponent: float, cost_alone: float) -> Float[Array, ""]:
+        """(Σ d^exponent + cost_alone times the number alone)^(1 / exponent)."""
         distances, num_alone = self.distances, jnp.sum(self.is_estimate ^ self.is_truth)
         # Powers of shares of the largest neither underflow nor have an infinite derivative.
         largest = jnp.max(jnp.where(self.is_pair, distances, 0.0), initial=0.0)
         largest = jax.lax.stop_gradient(jnp.where(num_alone > 0, 1.0, largest))
         nothing = largest == 0
         unit = jnp.where(nothing, 1.0, largest)
-        powers = jnp.where(self.is_pair, (distances / unit) ** order, 0.0)
+        powers = jnp.where(self.is_pair, (distances / unit) ** exponent, 0.0)
         total = jnp.sum(powers) + cost_alone * num_alone.astype(unit.dtype)
-        return jnp.where(nothing, 0.0, unit * jnp.where(nothing, 1.0, total) ** (1.0 / order))
+        return jnp.where(nothing, 0.0, unit * jnp.where(nothing, 1.0, total) ** (1.0 / exponent))
 
 
 def euclidean(estimates: Float[Array, "k d"], truths: Float[Array, "l d"]) -> Float[Array, "k l"]:
@@ -80,27 +93,33 @@ def ospa(
     truths: Float[Array, "l d"],
     *,
     cutoff: Positive,
-    order: Order = 2.0,
+    exponent: Exponent = 2.0,
     estimate_mask: Bool[Array, " k"] | None = None,
     truth_mask: Bool[Array, " l"] | None = None,
     base_distance: Callable[[Array, Array], Array] = euclidean,
-) -> Float[Array, ""]:
-    """The optimal sub-pattern assignment distance between estimates and true positions.
+) -> OSPA:
+    """The optimal sub-pattern assignment distance, with its parts: localisation and cardinality.
 
     Schuhmacher, Vo and Vo (2008): for m <= n entries in the two sets, the least over
     pairings of ((sum_i min(d_i, c)^p + c^p (n - m)) / n)^(1/p), with c the `cutoff` in the unit
-    of `base_distance` (pixels) and p the `order`. It is 0 for two empty sets and c where one is
-    empty. `cutoff` and `order` are Python numbers. Entries that a mask leaves out may hold
+    of `base_distance` (pixels) and p the `exponent`. It is 0 for two empty sets and c where one is
+    empty. `cutoff` and `exponent` are Python numbers. Entries that a mask leaves out may hold
     anything; a NaN in one that counts makes the distance NaN where the other set is not empty.
 
     Raises `ValueError` for sets that are no arrays, masks of another length, a cutoff that is not
-    positive and finite, and an order below 1 or infinite. Use it for an error per object;
+    positive and finite, and an exponent below 1 or infinite. Use it for an error per object;
     `gospa` says how many objects were missed.
     """
-    pairing = _paired(estimates, truths, cutoff, order, estimate_mask, truth_mask, base_distance)
+    pairing = _paired(estimates, truths, cutoff, exponent, estimate_mask, truth_mask, base_distance)
     size = jnp.maximum(jnp.sum(pairing.is_estimate), jnp.sum(pairing.is_truth))
     size = jnp.maximum(size, 1).astype(pairing.distances.dtype)
-    return cutoff * pairing.distance(order, 1.0) / size ** (1.0 / order)
+    powers = jnp.where(pairing.is_pair, (cutoff * pairing.distances) ** exponent, 0.0)
+    share = jnp.sum(pairing.is_estimate ^ pairing.is_truth, dtype=powers.dtype) / size
+    return OSPA(
+        distance=cutoff * pairing.distance(exponent, 1.0) / size ** (1.0 / exponent),
+        localisation=jnp.sum(powers) / size,
+        cardinality=_times(share, cutoff, exponent),
+    )
 
 
 @checked
@@ -109,7 +128,7 @@ def gospa(
     truths: Float[Array, "l d"],
     *,
     cutoff: Positive,
-    order: Order = 2.0,
+    exponent: Exponent = 2.0,
     alpha: Alpha = 2.0,
     estimate_mask: Bool[Array, " k"] | None = None,
     truth_mask: Bool[Array, " l"] | None = None,
@@ -119,7 +138,7 @@ def gospa(
 
     Rahmathullah, García-Fernández and Svensson (2017), eq. 1: for m <= n entries in the two sets,
     the least over pairings of (sum_i min(d_i, c)^p + (c^p / alpha) (n - m))^(1/p), with c the
-    `cutoff` in the unit of `base_distance` (pixels) and p the `order`. The parts are those of
+    `cutoff` in the unit of `base_distance` (pixels) and p the `exponent`. The parts are those of
     their Proposition 1: two entries paired at the cutoff or beyond are one miss and one false
     estimate, at c^p / 2 each. With alpha below 2 the parts still add up, but an entry left over
     costs c^p / alpha. Two empty sets are at distance 0. Numbers, masks and NaN are as in `ospa`.
@@ -127,24 +146,28 @@ def gospa(
     Raises `ValueError` as `ospa` does, and for an alpha outside (0, 2]. Use it to score trackers
     that may lose objects or invent them, with alpha at 2.
     """
-    pairing = _paired(estimates, truths, cutoff, order, estimate_mask, truth_mask, base_distance)
+    pairing = _paired(estimates, truths, cutoff, exponent, estimate_mask, truth_mask, base_distance)
     near = pairing.is_pair & ~(pairing.distances >= 1.0)
-    localisation = jnp.sum(jnp.where(near, (cutoff * pairing.distances) ** order, 0.0))
-    dtype = localisation.dtype
-    with np.errstate(over="ignore"):
-        scale = jnp.asarray(np.float64(cutoff) ** order, dtype)
+    localisation = jnp.sum(jnp.where(near, (cutoff * pairing.distances) ** exponent, 0.0))
 
     def cost(is_there: Bool[Array, " s"]) -> Float[Array, ""]:
         shares = jnp.where(pairing.is_pair, 0.5, 1.0 / alpha)
-        share = jnp.sum(jnp.where(is_there & ~near, shares, 0.0), dtype=dtype)
-        return jnp.where(share > 0, scale, 0.0) * share
+        share = jnp.sum(jnp.where(is_there & ~near, shares, 0.0), dtype=localisation.dtype)
+        return _times(share, cutoff, exponent)
 
     return GOSPA(
-        distance=cutoff * pairing.distance(order, 1.0 / alpha),
+        distance=cutoff * pairing.distance(exponent, 1.0 / alpha),
         localisation=localisation,
         missed=cost(pairing.is_truth),
         false=cost(pairing.is_estimate),
     )
+
+
+def _times(share: Float[Array, ""], cutoff: float, exponent: float) -> Float[Array, ""]:
+    """share cutoff^exponent, also where the power is no number in the share's precision."""
+    with np.errstate(over="ignore"):
+        scale = jnp.asarray(np.float64(cutoff) ** exponent, share.dtype)
+    return jnp.where(share > 0, scale, 0.0) * share
 
 
 # Costs below this share of the largest are lost in the sums of the search.
@@ -152,8 +175,8 @@ _FINE = 1e-3
 
 
 def _paired(
-    estimates: Any, truths: Any, cutoff: float, order: float, estimate_mask: Any, truth_mask: Any,
-    base_distance: Callable[[Array, Array], Array],
+    estimates: Any, truths: Any, cutoff: float, exponent: float,
+    estimate_mask: Any, truth_mask: Any, base_distance: Callable[[Array, Array], Array],
 ) -> _Pairing:  # fmt: skip
     """The cheapest pairing of the two sets; a `ValueError` for sets that will not do.
 
@@ -175,7 +198,7 @@ def _paired(
     known, most = jax.lax.stop_gradient(jnp.nan_to_num(capped)), size + 1.0
 
     def search(unit: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
-        costs = jnp.minimum((known / unit) ** order, most)
+        costs = jnp.minimum((known / unit) ** exponent, most)
         costs = jnp.where(is_alone, most, costs)
         # It works in the default precision, and under strict promotion it converts nothing itself.
         i, j = _assign(costs.astype(float))
@@ -184,7 +207,7 @@ def _paired(
 
     def is_coarse(found: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
         unit, largest, _, _ = found
-        return (largest > 0) & ((largest / unit) ** order < _FINE)
+        return (largest > 0) & ((largest / unit) ** exponent < _FINE)
 
     first = search(jnp.ones((), known.dtype))
     _, _, i, j = jax.lax.while_loop(is_coarse, lambda found: search(found[1]), first)
