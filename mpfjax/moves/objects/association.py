@@ -1,14 +1,16 @@
 """Which measurement is whose: joint probabilities of pairs by loopy belief propagation."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Float
 
-from mpfjax.operations.logarithms import without_gradient
+from mpfjax.operations.logarithms import log_or_nothing, without_gradient
 
-_ROUNDS, _SETTLED = 100, 1e-4  # most rounds of messages, and the relative change that ends them
+_ROUNDS, _SETTLED = 100, 1e-3  # most rounds of messages, and the relative change that ends them
 _FOLLOWED = 5  # rounds that a derivative of the marginals follows; each shrinks what is left out
 _LEAST = 1e-30  # weights of rows and columns alone count as at least this, and stay finite
 
@@ -37,47 +39,56 @@ def associate(
     The total is stationary in the messages, so that its derivative is exact for what is
     approximated; that of the marginals follows the last rounds.
     """
-    missed, alone = jnp.maximum(missed, _LEAST), jnp.maximum(alone, _LEAST)
+    missed, alone = missed + _LEAST, alone + _LEAST
     settled = without_gradient((pairs, missed, alone))
+    replies = settled_replies(*settled)
+    to_columns, to_rows = _claims(replies, *settled[:2]), replies
+    log_total = (
+        jnp.sum(jnp.log(missed + jnp.sum(pairs * to_rows, axis=1)))
+        + jnp.sum(jnp.log(alone + jnp.sum(to_columns, axis=0)))
+        - jnp.sum(jnp.logaddexp(0.0, log_or_nothing(to_columns) + jnp.log(to_rows)))
+    )
+    for _ in range(_FOLLOWED):
+        replies = _next_replies(replies, pairs, missed, alone)
+    row_sums = missed + jnp.sum(pairs * replies, axis=1)
+    column_sums = alone + jnp.sum(_claims(replies, pairs, missed), axis=0)
+    return Association(replies, row_sums, column_sums, log_total)
 
-    def claims(replies: Array, pairs: Array, missed: Array, alone: Array) -> Array:
-        return pairs / (missed[:, None] + _sums_of_others(pairs * replies, axis=1))
 
-    def next_replies(replies: Array, *weights: Array) -> Array:
-        return 1 / (weights[2][None] + _sums_of_others(claims(replies, *weights), axis=0))
+def settled_replies(pairs: Any, missed: Any, alone: Any) -> Any:
+    """The messages from columns to rows, once they settle; of arrays of JAX or of NumPy."""
 
-    def unsettled(carry: tuple) -> Bool[Array, ""]:
+    def unsettled(carry: tuple) -> Any:
         return (carry[0] < _ROUNDS) & (carry[1] > _SETTLED)
 
     def next_round(carry: tuple) -> tuple:
         number, _, replies = carry
-        changed = next_replies(replies, *settled)
-        change = jnp.max(jnp.abs(changed - replies) / changed, initial=0.0)
-        return number + 1, change, changed
+        changed = _next_replies(replies, pairs, missed, alone)
+        return number + 1, (abs(changed - replies) / changed).max(initial=0.0), changed
 
-    first = jnp.broadcast_to(1 / settled[2], pairs.shape)
-    start = (0, jnp.ones((), pairs.dtype), first)
-    replies = jax.lax.while_loop(unsettled, next_round, start)[-1]
-    to_columns, to_rows = claims(replies, *settled), replies
-    log_total = (
-        jnp.sum(jnp.log(missed + jnp.sum(pairs * to_rows, axis=1)))
-        + jnp.sum(jnp.log(alone + jnp.sum(to_columns, axis=0)))
-        - jnp.sum(jnp.logaddexp(0.0, _log(to_columns) + jnp.log(to_rows)))
-    )
-    for _ in range(_FOLLOWED):
-        replies = next_replies(replies, pairs, missed, alone)
-    row_sums = missed + jnp.sum(pairs * replies, axis=1)
-    column_sums = alone + jnp.sum(claims(replies, pairs, missed, alone), axis=0)
-    return Association(replies, row_sums, column_sums, log_total)
+    start = (0, pairs.dtype.type(1), 0 * pairs + 1 / alone[None])
+    repeated = jax.lax.while_loop if isinstance(pairs, jax.Array) else _while
+    return repeated(unsettled, next_round, start)[-1]
 
 
-def _log(values: Float[Array, "m k"]) -> Float[Array, "m k"]:
-    return jnp.where(values > 0, jnp.log(jnp.where(values > 0, values, 1.0)), -jnp.inf)
+def _while(goes_on: Callable, advanced: Callable, carry: tuple) -> tuple:
+    while goes_on(carry):
+        carry = advanced(carry)
+    return carry
 
 
-def _sums_of_others(values: Float[Array, "m k"], axis: int) -> Float[Array, "m k"]:
+def _claims(replies: Any, pairs: Any, missed: Any) -> Any:
+    return pairs / (missed[:, None] + _sums_of_others(pairs * replies, axis=1))
+
+
+def _next_replies(replies: Any, pairs: Any, missed: Any, alone: Any) -> Any:
+    return 1 / (alone[None] + _sums_of_others(_claims(replies, pairs, missed), axis=0))
+
+
+def _sums_of_others(values: Any, axis: int) -> Any:
     """Sums of each row (1) or column (0) without the entry itself, which may be most of it."""
-    totals = jnp.sum(values, axis=axis, keepdims=True)
+    totals = values.sum(axis=axis, keepdims=True)
     is_most = values > 0.5 * totals
-    rest = jnp.sum(jnp.where(is_most, 0.0, values), axis=axis, keepdims=True)
-    return jnp.where(is_most, rest, totals - values)
+    where = jnp.where if isinstance(values, jax.Array) else np.where
+    rest = where(is_most, 0.0, values).sum(axis=axis, keepdims=True)
+    return where(is_most, rest, totals - values)

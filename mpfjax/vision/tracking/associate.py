@@ -5,15 +5,15 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
+from mpfjax.moves.objects.association import settled_replies
 from mpfjax.vision.tracking.gaussian import Gaussian, along
 
 _FREEDOM = 4.0  # degrees, of Student's distribution of gaps
 _COLOUR_COST, _UNDECIDED = 14.0, 0.25  # of B², and where it is evidence neither for nor against
 _ADAPTATION = 0.14  # the share of a frame in an object's colours
+_LEAST = 1e-30  # a row without a pair weighs at least this beside its best pair
 _WIDEST = -0.5  # log |S| counts as at most this: a detection at the prediction forms a pair
 TEMPERATURE = 2.0  # above 1 it allows for cues that are not independent
-_ROUNDS, _SETTLED = 15, 1e-3  # most iterations of messages, and the change that ends them
-_RESOLVED = 1e-6  # odds of all others below this are not told from none
 
 
 def compatible(a: Int[np.ndarray, " m"], b: Int[np.ndarray, " d"]) -> Bool[np.ndarray, "m d"]:
@@ -86,25 +86,12 @@ def marginals(log_odds: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
     """The probability of each pair, where each row and each column is in at most one pair.
 
     An assignment has the weight Π exp(log_odds) over its pairs; a row or column without a pair
-    contributes a factor of 1. The marginals of this joint distribution (joint probabilistic data
-    association, Fortmann et al. 1983) are computed by loopy belief propagation with messages from
-    rows to columns and back (Williams and Lau 2014). They are exact where the possible pairs form
-    no cycle. Otherwise they are overconfident: up to .41 where each of two rows can go with each of
-    two columns.
+    contributes a factor of 1. The marginals are those of `mpfjax.moves.objects.association`.
     """
-    highest = np.maximum(np.max(log_odds, axis=1, keepdims=True, initial=0.0), 0.0)
-    odds, none = np.exp(log_odds - highest), np.exp(-highest)
-    back = np.ones_like(odds)
-    for _ in range(_ROUNDS):
-        weighed = odds * back
-        others = none + np.sum(weighed, axis=1, keepdims=True) - weighed
-        forth = odds / np.maximum(others, _RESOLVED)
-        reply = 1 / (1 + np.maximum(np.sum(forth, axis=0, keepdims=True) - forth, 0.0))
-        change, back = np.max(np.abs(reply - back), initial=0.0), reply
-        if change <= _SETTLED:
-            break
-    weighed = odds * back
-    return weighed / (none + np.sum(weighed, axis=1, keepdims=True))
+    highest = np.maximum(np.max(log_odds, axis=1, initial=0.0), 0.0)
+    pairs, missed = np.exp(log_odds - highest[:, None]), np.exp(-highest) + _LEAST
+    weighed = pairs * settled_replies(pairs, missed, np.ones(pairs.shape[1]))
+    return weighed / (missed + np.sum(weighed, axis=1))[:, None]
 
 
 def probabilities(
