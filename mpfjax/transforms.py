@@ -33,7 +33,7 @@ def map_moves(filter: Filter, change: Callable[[Any], Any], *, within: bool = Tr
     It reaches the moves that others hold first, as those of an `Every`, and the resampling within a
     `Partitioned`:
 
-        map_moves(filter, lambda m: Resample("ssp") if isinstance(m, Resample) else m)
+        map_moves(filter, lambda m: Resample("stratified") if isinstance(m, Resample) else m)
 
     - `within`: whether also those that propagations hold, or the chain's own moves alone.
     """

@@ -87,10 +87,10 @@ BUGS = {
         "tests/running/test_storage.py -k LongRuns",
     ),
     # Filters, resampling and regrouping.
-    "residual resampling draws from what is expected in all": Bug(
+    "a point of stratified resampling is drawn in the slot after its own": Bug(
         "moves/resampling/ancestors.py",
-        "dealt.line.positions(jnp.maximum(expected - whole, 0.0), left, rest.firsts)",
-        "dealt.line.positions(expected, left, rest.firsts)",
+        "slot = jnp.clip(dealt.before.whole, 0, shift.shape[0] - 1)",
+        "slot = jnp.clip(dealt.before.whole + 1, 0, shift.shape[0] - 1)",
         "tests/moves/test_contracts.py -k unbiased",
     ),
     "a look-ahead is not divided out again": Bug(

@@ -42,7 +42,7 @@ NUM_COMPONENTS, MANY_COMPONENTS = 3, 6
 
 
 # What is done in another way for many.
-OTHERWISE_OF_MANY = ("mpf", "mpf rqmc", "guided, sorted", "random labels, residual")
+OTHERWISE_OF_MANY = ("mpf", "mpf rqmc", "guided, sorted", "random labels, stratified")
 
 
 class RandomLabels(AbstractRegrouping):
@@ -73,14 +73,11 @@ WITHIN_COMPONENTS: dict[str, AbstractResampling] = {
     "systematic": Resample(),
     "stratified": Resample("stratified"),
     "multinomial": Resample("multinomial"),
-    "residual": Resample("residual"),
-    "ssp": Resample("ssp"),
-    "ssp, adaptive": Resample("ssp", ess_threshold=0.5),
     "multinomial, adaptive": Resample("multinomial", ess_threshold=0.5),
     "systematic, sorted": Resample(sort_by=lambda states: states[:, 0]),
     "systematic, along a Hilbert curve, adaptive": Resample(ess_threshold=0.5, sort_by="hilbert"),
-    "residual, fixed number, adaptive": Resample(
-        "residual", ess_threshold=0.5, particles_per_component=5
+    "stratified, fixed number, adaptive": Resample(
+        "stratified", ess_threshold=0.5, particles_per_component=5
     ),
     "stratified, shared equally": Resample("stratified", allocation="equal"),
     "gaussian": GaussianRegeneration(),
@@ -169,7 +166,7 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         "grouped by a label": _chain(Resample(), m=m, then=[GroupBy(_side)]),
         "kmeans only": _chain(Resample("stratified"), m=m, then=[KMeans()]),
         "split only, adaptive": _chain(Resample(ess_threshold=0.5), m=m, then=[Split(2.0)]),
-        "random labels, residual": _chain(RandomLabels(), Resample("residual"), m=m),
+        "random labels, stratified": _chain(RandomLabels(), Resample("stratified"), m=m),
         "gaussian mixture": _chain(GaussianRegeneration(), m=m, then=[KMeans()]),
         "exclusion": _chain(
             Resample("stratified"),
@@ -194,7 +191,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),
     "pf multinomial": _pf(scheme="multinomial"),
     "pf adaptive": _pf(ess_threshold=0.5),
-    "pf ssp": _pf(scheme="ssp"),
+    "pf stratified": _pf(scheme="stratified"),
     "pf rqmc": _pf(noise="rqmc"),
     "pf rqmc of many initial draws": lambda model: mpfjax.with_proposals_per_particle(
         mpfjax.with_selected_start(_pf(noise="rqmc")(model), 3), 2

@@ -57,11 +57,11 @@ def test_they_compose_on_a_chain_of_ones_own():
         with_point_sets,
         with_score_gradient,
         lambda f: with_selected_start(f, 3),
-        lambda f: with_resampling(f, Resample("ssp")),
+        lambda f: with_resampling(f, Resample("stratified")),
     ):
         filter = change(filter)
     every, propagate = filter.moves
-    assert every.moves[0].scheme == "ssp"
+    assert every.moves[0].scheme == "stratified"
     assert (propagate.noise, propagate.gradient, filter.initial_noise) == ("rqmc", "stop", "rqmc")
     select = filter.initial_moves[0]
     assert isinstance(select, SelectInitial)

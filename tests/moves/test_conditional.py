@@ -19,13 +19,13 @@ WEIGHTS = np.array([0.3, 0.1, 0.02, 0.14, 0.0, 0.11, 0.2, 0.13])
 LABELS = {1: np.zeros(8, int), 2: np.array([0, 1, 0, 1, 0, 1, 0, 1]), 8: np.arange(8)[::-1]}
 CASES = {
     **{f"{scheme}, M = 2": (Resample(scheme), 2) for scheme in SCHEMES},
-    **{f"{scheme}, M = 1": (Resample(scheme), 1) for scheme in ("multinomial", "residual", "ssp")},
+    **{f"{scheme}, M = 1": (Resample(scheme), 1) for scheme in SCHEMES},
     "systematic, sorted, M = 1": (Resample(sort_by=lambda x: -x), 1),
     "systematic, fixed number, M = 2": (Resample(particles_per_component=3), 2),
-    "ssp, adaptive, M = 2": (Resample("ssp", ess_threshold=0.8), 2),
+    "stratified, adaptive, M = 2": (Resample("stratified", ess_threshold=0.8), 2),
     "systematic, M = 8": (Resample(), 8),
 }
-QUICK = ["systematic, M = 2", "ssp, M = 2"]
+QUICK = ["systematic, M = 2", "multinomial, M = 2"]
 over_cases = pytest.mark.parametrize("case", quick_of(CASES, QUICK))
 
 

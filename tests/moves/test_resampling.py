@@ -1,7 +1,6 @@
 """Resampling at its edges and its slots; what every scheme keeps is in `test_contracts.py`."""
 
 import itertools
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -75,7 +74,7 @@ def redraw_with(move):
     ("scheme", "n", "most"),
     quick_of(
         [("systematic", 100_000, None), *((s, 1003, 0) for s in SCHEMES)],
-        [("systematic", 1003, 0), ("ssp", 1003, 0)],
+        [("systematic", 1003, 0), ("multinomial", 1003, 0)],
     ),
 )
 def test_no_particle_of_zero_weight_is_ever_fed(scheme, n, most, monkeypatch):
@@ -111,7 +110,7 @@ MANY, NUM_KEYS = 2**17, 20
 @pytest.mark.parametrize(
     ("scheme", "kind", "m"),
     [("systematic", "random", 12), ("stratified", "in turn", 1), ("multinomial", "in turn", 1),
-     ("residual", "sorted", 12), ("ssp", "random", 1)],
+     ("multinomial", "sorted", 12), ("systematic", "sorted", 1)],
 )  # fmt: skip
 def test_means_of_many_particles_stay_where_they_are(scheme, kind, m):
     """Within four standard errors over the keys, of the mixture and of every component."""
@@ -152,20 +151,6 @@ def test_points_stay_within_their_components_stretch_of_slots(monkeypatch):
     assert (points.whole >= np.asarray(slots.firsts)[own]).all()
     assert (points.whole < ends[own]).all()
     assert ((points.fraction >= 0) & (points.fraction < 1)).all()
-
-
-def test_ssp_draws_no_two_neighbours_together_as_systematic_resampling_does():
-    """Four particles expect 0.5 each: a systematic draw has but two outcomes."""
-    mixture = make_mixture(np.arange(8.0), np.log(np.tile([0.25, 0.75], 4)), np.zeros(8), 1)
-    counts = {}
-    for scheme in ("systematic", "ssp"):
-        each = jax.vmap(partial(Resample(scheme), mixture=mixture))
-        drawn = np.asarray(jax.jit(each)(jax.random.split(KEY, 2000)).ancestor_indices)
-        counts[scheme] = (drawn[..., None] == np.arange(8)).sum(axis=1)
-    assert len(np.unique(counts["systematic"], axis=0)) == 2
-    assert len(np.unique(counts["ssp"], axis=0)) > 10
-    # No two particles are drawn together more often than apart.
-    assert np.cov(counts["ssp"].T)[~np.eye(8, dtype=bool)].max() < 4 * 0.25 / np.sqrt(2000)
 
 
 def test_components_draw_their_offsets_independently():

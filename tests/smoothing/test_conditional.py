@@ -46,7 +46,7 @@ CASES = {
         True,
     ),
     "resampled every second step": (
-        chain(mpfjax.Every(2, [Resample("ssp"), KMeans(2)]), Propagate(), n=8, m=3),
+        chain(mpfjax.Every(2, [Resample("stratified"), KMeans(2)]), Propagate(), n=8, m=3),
         True,
     ),
 }  # fmt: skip

@@ -79,7 +79,7 @@ def chain_filter(chain, model):
 
 # What the state is makes no difference to regrouping: a second model for a few, and more slots than
 # particles for what deals with them, each in its own way.
-IN_SLOTS = ("pf ssp", "pf multinomial", "metropolis", "mpf", "random labels, residual")
+IN_SLOTS = ("pf stratified", "pf multinomial", "metropolis", "mpf", "random labels, stratified")
 OTHERWISE = [
     ("guided pf", "drift of one", None),
     *((chain, "drift", None) for chain in ("guided mpf", "partitioned in clusters", "mpf rqmc")),

@@ -1,4 +1,4 @@
-"""Resampling within components: systematic, stratified, multinomial, residual or SSP."""
+"""Resampling within components: systematic, stratified or multinomial."""
 
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
@@ -36,9 +36,8 @@ class Resample(AbstractResampling):
     equally. The expected number of offspring of particle i is k_m w_i for every scheme, so the
     marginal likelihood stays unbiased.
 
-    - `scheme`: "systematic" (the default: least noise, O(n)), "stratified", "multinomial" (the
-      textbook's, most noise), "residual" or "ssp" (Gerber, Chopin and Whiteley 2019: as even as
-      systematic, and consistent in whatever order the particles stand; ten times slower).
+    - `scheme`: "systematic" (the default: least noise, least work), "stratified", or "multinomial"
+      (the textbook's, most noise).
     - `ess_threshold`: a component is resampled if its effective sample size is below this share of
       its particles. 1.0 resamples at every step. Under `vmap`, a lower one saves no time.
     - `particles_per_component`: None shares all slots among the living components that are
