@@ -26,7 +26,7 @@ CASES = {
     "systematic, M = 8": (Resample(), 8),
 }
 QUICK = ["systematic, M = 2", "multinomial, M = 2"]
-over_cases = pytest.mark.parametrize("case", quick_of(CASES, QUICK))
+over_cases = pytest.mark.parametrize("case", quick_of(CASES, QUICK, one_in=3))
 
 
 @cache

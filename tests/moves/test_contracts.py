@@ -81,7 +81,7 @@ def draws_of(move, mixture):
     return jax.vmap(lambda key: move(key, mixture))(keys)
 
 
-@pytest.mark.parametrize(("name", "m"), quick_of(CASES, QUICK))
+@pytest.mark.parametrize(("name", "m"), quick_of(CASES, QUICK, one_in=2))
 def test_components_keep_their_mass_and_their_offspring(name, m):
     """And a slot is fed from a particle of weight, as many of them as the move says."""
     move = WITHIN_COMPONENTS[name]
@@ -107,7 +107,7 @@ def test_components_keep_their_mass_and_their_offspring(name, m):
             np.testing.assert_array_equal(after.particles[filled], copied)
 
 
-@pytest.mark.parametrize(("name", "m"), quick_of(RESAMPLINGS, QUICK))
+@pytest.mark.parametrize(("name", "m"), quick_of(RESAMPLINGS, QUICK, one_in=2))
 def test_offspring_are_unbiased_where_resampled_and_kept_elsewhere(name, m):
     """E[weight of i's offspring] is i's weight, the definition of unbiased resampling."""
     move = WITHIN_COMPONENTS[name]

@@ -72,7 +72,7 @@ def final_of(name):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), runs(name).final)
 
 
-@pytest.mark.parametrize("name", quick_of(FILTERS, QUICK))
+@pytest.mark.parametrize("name", quick_of(FILTERS, QUICK, one_in=2))
 def test_evidence_regimes_and_moments_are_unbiased(name):
     """E[Ẑ/Z] = 1 and E[Ẑ/Z φ̂] = E[φ | y] at every step, against all sequences of regimes."""
     run, exact = runs(name), truth()

@@ -92,7 +92,7 @@ EXACT = [
     *quick_of(
         [(chain, "quadratic", None) for chain in CHAINS if chain not in APPROXIMATE],
         [(chain, "quadratic", None) for chain in COVERING],
-        one_in=2,
+        one_in=3,
     ),
     *exactness(OTHERWISE),
 ]

@@ -61,7 +61,7 @@ QUICK = ("backward sampling", "PaRIS", "conditional filter")
 
 
 @pytest.mark.parametrize("model", quick_of(["two modes", "one dimension"], ["two modes"]))
-@pytest.mark.parametrize("name", quick_of(SMOOTHERS, QUICK))
+@pytest.mark.parametrize("name", quick_of(SMOOTHERS, QUICK, one_in=3))
 def test_every_smoother_is_traced(name, model):
     (model, seen), smoother = models()[model], SMOOTHERS[name]
     filter = CHAINS["pf"](model)

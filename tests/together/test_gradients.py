@@ -95,7 +95,7 @@ def deviations(name, transform):
     return found
 
 
-@pytest.mark.parametrize("name", quick_of(FILTERS, ["pf"]))
+@pytest.mark.parametrize("name", quick_of(FILTERS, ["pf"], one_in=2))
 def test_stop_gradient_scores_are_unbiased(name):
     """∇Ẑ = Ẑ ∇log Ẑ is an unbiased estimate of ∇Z, for any number of particles."""
     found = deviations(name, (lambda f: f) if name == "pathwise" else with_score_gradient)
