@@ -11,7 +11,7 @@ Mixture = tuple[np.ndarray, np.ndarray, np.ndarray]  # weights, means and covari
 
 
 def followed(scene: Scene, scans: tuple[np.ndarray, ...]) -> Iterator[tuple[np.ndarray, float]]:
-    """The positions of the objects after each scan, and how many to expect.
+    """The positions of the objects after each scan, and how many there are.
 
     Objects that may appear anywhere are born at the plots of the scan before, with the velocity
     unknown, as filters with births from measurements have it. Several sensors correct in turn.
@@ -20,16 +20,14 @@ def followed(scene: Scene, scans: tuple[np.ndarray, ...]) -> Iterator[tuple[np.n
     w, m, P = _around_spots(scene, scene.first)
     for plots in zip(*scans, strict=True):
         seen = [each[~np.isnan(each[:, 0])] for each in plots]
-        F = _slopes(moved, m)
-        P = F @ P @ F.swapaxes(1, 2) + scene.root @ scene.root.T
-        w, m = SURVIVAL * w, moved(m)
+        w, (m, P) = SURVIVAL * w, predicted(scene, m, P)
         w, m, P = (np.concatenate(pair) for pair in zip((w, m, P), born, strict=True))
         for sensor, z in zip(scene.sensors, seen, strict=True):
-            w, m, P = _merged(*_updated(sensor, w, m, P, z))
+            w, m, P = _merged(*updated(sensor, w, m, P, z))
         number = np.round(w).astype(int)
-        yield np.repeat(m[:, PLACE], number, axis=0), float(w.sum())
+        yield np.repeat(m[:, PLACE], number, axis=0), float(np.round(w.sum()))
         if scene.spots is None:
-            born = _at_plots(scene, seen[0])
+            born = at_plots(scene, scene.sensors[0], seen[0])
 
 
 def _around_spots(scene: Scene, number: float) -> Mixture:
@@ -41,9 +39,15 @@ def _around_spots(scene: Scene, number: float) -> Mixture:
     return rate, spots, np.broadcast_to(P, (len(spots), size, size))
 
 
-def _at_plots(scene: Scene, z: np.ndarray) -> Mixture:
-    """New objects at plots of the first sensor."""
-    sensor, places, R = scene.sensors[0], z, np.diag(np.square(scene.sensors[0].deviations))
+def predicted(scene: Scene, m: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means and covariances a second later."""
+    F = _slopes(moved, m)
+    return moved(m), F @ P @ F.swapaxes(1, 2) + scene.root @ scene.root.T
+
+
+def at_plots(scene: Scene, sensor: Sensor, z: np.ndarray) -> Mixture:
+    """New objects at a sensor's plots."""
+    places, R = z, np.diag(np.square(sensor.deviations))
     P = np.zeros((len(z), 4, 4)) + np.diag(np.square(scene.deviations))
     if sensor.origin is not None:
         r, angle = z.T
@@ -61,7 +65,7 @@ def _slopes(function: Callable, x: np.ndarray) -> np.ndarray:
     return np.stack([(function(x + h) - function(x - h)) / 2e-4 for h in steps], axis=-1)
 
 
-def _updated(sensor: Sensor, w: np.ndarray, m: np.ndarray, P: np.ndarray, z: np.ndarray) -> Mixture:
+def updated(sensor: Sensor, w: np.ndarray, m: np.ndarray, P: np.ndarray, z: np.ndarray) -> Mixture:
     """The intensity after a scan: table I of the paper."""
     d, p = m.shape[1], sensor.detection(m)
     H = _slopes(lambda x: sensor.seen(x).T, m)

@@ -20,9 +20,8 @@ Rate = Annotated[Float[Array, ""], POSITIVE]
 class AbstractBirth(eqx.Module):
     """The Poisson process of new objects in a step: `rate` of them, each with x ~ b.
 
-    A subclass has `rate`, a positive number, and `sample`. With `propose`, a new object's
-    particles start at a measurement; without it there must be enough draws of b near each, as
-    where objects appear at a few known spots.
+    A subclass has `rate`, a positive number, `sample`, and `propose`, by which the particles of a
+    new object start at a measurement.
     """
 
     rate: eqx.AbstractVar[Float[Array, ""]]
@@ -31,11 +30,11 @@ class AbstractBirth(eqx.Module):
     def sample(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """Draw states of new objects, x ~ b."""
 
+    @abc.abstractmethod
     def propose(
         self, key: Key[Array, ""], measurement: PyTree, num_particles: int, sensor: int = 0
-    ) -> tuple[PyTree, Float[Array, " n"]] | None:
+    ) -> tuple[PyTree, Float[Array, " n"]]:
         """States of new objects that a sensor's measurement may come from, and log b(x) / q(x)."""
-        return None
 
 
 class Box(Fitting):
@@ -86,7 +85,7 @@ class UniformBirth(AbstractBirth, Fitting):
       draws the rest of the state, such as a speed.
     - `locate`: a function `(key, measurement, n) -> (places, log_density)`, which draws places
       that a measurement may come from, and has the log of their density, (n,); one for each
-      sensor where there are several. None where new objects are to come from `newborn` alone.
+      sensor where there are several.
 
     Raises `ValueError` for a rate that is not positive. Use it where objects enter unannounced.
     """
@@ -94,7 +93,7 @@ class UniformBirth(AbstractBirth, Fitting):
     rate: Rate = eqx.field(converter=to_array("rate"))
     region: Box | Disc
     newborn: Callable[[Key[Array, ""], Array], PyTree]
-    locate: Callable[..., tuple] | tuple[Callable[..., tuple] | None, ...] | None = None
+    locate: Callable[..., tuple] | tuple[Callable[..., tuple], ...]
 
     def sample(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """States in the region."""
@@ -103,11 +102,9 @@ class UniformBirth(AbstractBirth, Fitting):
 
     def propose(
         self, key: Key[Array, ""], measurement: PyTree, num_particles: int, sensor: int = 0
-    ) -> tuple[PyTree, Float[Array, " n"]] | None:
+    ) -> tuple[PyTree, Float[Array, " n"]]:
         """States at places drawn by `locate`."""
         locate = self.locate[sensor] if isinstance(self.locate, tuple) else self.locate
-        if locate is None:
-            return None
         key_place, key_rest = jax.random.split(key)
         places, log_density = locate(key_place, measurement, num_particles)
         return self.newborn(key_rest, places), self.region.log_density(places) - log_density

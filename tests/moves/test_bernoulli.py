@@ -14,6 +14,7 @@ from mpfjax import ClutteredModel, Filter, TargetsModel
 from mpfjax.moves.objects.association import associate
 from mpfjax.moves.objects.bernoulli import TARGETS, Associate
 from mpfjax.moves.propagation.propagate import Predict
+from tests.marking import exactness
 from tests.models.test_clutter import SETS, by_associations
 from tests.unbiased import assert_unbiased
 
@@ -238,7 +239,17 @@ def predicted(gaussian, survival):
     return survival * weight, A * mean, A**2 * variance + Q
 
 
-def test_objects_not_detected_yet_are_those_of_gaussian_sums():
+class Wide(mpfjax.AbstractProposal):
+    """x_t from a density twice as wide as the object's."""
+
+    def propose(self, key, now, previous_states):
+        noise, scale = jax.random.normal(key, previous_states.shape), 2 * np.sqrt(Q)
+        log_density = jax.scipy.stats.norm.logpdf(noise[:, 0]) - np.log(scale)
+        return A * previous_states + scale * noise, log_density
+
+
+@pytest.mark.parametrize("proposal", [None, *exactness([Wide()])])
+def test_objects_not_detected_yet_are_those_of_gaussian_sums(proposal):
     """Two scans from a Poisson number of objects, in whose second no two compete."""
     number, rate, survival = 2.0, 0.5, 0.95
     first, second = np.array([-2.5, 2.0]), 2.2
@@ -266,6 +277,7 @@ def test_objects_not_detected_yet_are_those_of_gaussian_sums():
     filter = mpfjax.bernoulli_filter(
         model(rate, survival_probability=survival, initial_number=number), 3000, 6,
         particles_per_birth=500, undetected_particles=1000, resample=mpfjax.Resample(),
+        proposal=proposal,
     )  # fmt: skip
     scans = jnp.asarray([[[-2.5], [2.0]], [[second], [NAN]]], jnp.float32)
     runs = mpfjax.monte_carlo(jax.random.split(KEY, 20), filter, scans, collect=mpfjax.targets)
@@ -347,10 +359,37 @@ def test_objects_without_room_are_told_and_the_table_has_the_rest():
     np.testing.assert_allclose(run.collected.expected_number[-1], 3, atol=0.7)
     with pytest.raises(ValueError, match="slots: "):
         mpfjax.monte_carlo(KEY[None], mpfjax.bernoulli_filter(crowd, 900, 2), scans, slots=600)
+    with pytest.raises(ValueError, match="not for islands"):
+        mpfjax.run_islands(KEY, mpfjax.bernoulli_filter(crowd, 900, 2), scans, num_islands=2)
     with pytest.raises(ValueError, match="model: "):
         Filter(OBJECT, [Predict(), Associate()], 1000, 3)
     with pytest.raises(ValueError, match="num_particles: 100 is less than 402"):
         Filter(crowd, [Predict(), Associate()], 100, 3)
+
+
+@pytest.mark.weekly
+def test_every_way_to_run_takes_inputs_and_missing_scans(tmp_path):
+    """A known object that u_t moves by 5, and whose third scan is missing."""
+    moving = mpfjax.LinearGaussianModel([[1.0]], [[0.01]], [[1.0]], [[R]], [0.0], [[P0]], B=[[1.0]])
+    certain = TargetsModel(ClutteredModel(moving, 0.99, 1e-3), Birth(jnp.float32(1e-6)), 1.0, 1.0)
+
+    def build(num_particles):
+        return mpfjax.bernoulli_filter(certain, num_particles, 2, undetected_particles=100)
+
+    filter, keys = build(300), jax.random.split(KEY, 2)
+    scans = jnp.array([0.2, 5.1, NAN, 15.3])[:, None, None]
+    inputs, present = np.array([[0.0], [5.0], [5.0], [5.0]], np.float32), np.arange(4) != 2
+    series = mpfjax.Series(scans.at[2].set(0.0), inputs, present=present)
+    run = mpfjax.run_filter(keys[0], filter, series, collect=mpfjax.targets)
+    np.testing.assert_allclose(run.collected.means[1:, 0, 0], [5, 10, 15], atol=0.8)
+    assert run.collected.number.tolist() == [1, 1, 1, 1]
+    mpfjax.save_checkpoint(tmp_path / "final", run.final)
+    again = mpfjax.load_checkpoint(tmp_path / "final", filter.init(KEY))
+    np.testing.assert_array_equal(mpfjax.targets(again).labels, run.collected.labels[-1])
+    study = mpfjax.Study({"bernoulli": build}, [300], keys, series)
+    (cell,) = mpfjax.run_study(study, tmp_path / "study")
+    total = run.log_marginal_likelihood
+    np.testing.assert_allclose(cell["log_marginal_likelihood"][0], total, rtol=1e-5)
 
 
 def test_the_number_is_that_of_independent_events():

@@ -82,7 +82,9 @@ COLLECTED = FILTERED | {"collect": nothing}
 MANY = {"keys": KEY[None], "observations": TWO}
 GUIDE = mpfjax.GaussNewtonProposal()
 SENSOR = {"object_model": MODEL, "detection_probability": 0.9, "clutter_density": 0.1}
-BIRTH = {"rate": 1.0, "region": mpfjax.Box([0.0], [1.0]), "newborn": difference}
+BIRTH = {
+    "rate": 1.0, "region": mpfjax.Box([0.0], [1.0]), "newborn": difference, "locate": difference,
+}  # fmt: skip
 TARGETS = {
     "sensors": mpfjax.ClutteredModel(**SENSOR), "birth": mpfjax.UniformBirth(**BIRTH)
 }  # fmt: skip

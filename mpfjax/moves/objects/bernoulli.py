@@ -67,7 +67,7 @@ class Associate(AbstractWrapper):
     4. The M most probable objects stay, the first in component 1. Others, and those below
        `least_existence`, go to component 0 and are no longer told apart, so that none is lost
        (Williams 2012).
-    5. Each component is resampled, by `resample`.
+    5. Each component is resampled, by `resample`, and component 0 systematically.
 
     The mass grows by log p of the scan over that of clutter alone, as that of `ClutteredModel`.
     Three things are approximate: belief propagation, whose log p is Bethe's, and exact where no two
@@ -79,7 +79,6 @@ class Associate(AbstractWrapper):
     - `undetected_particles`: those of component 0, which fill the first slots.
     - `least_existence`: an object less probable than this has no component of its own.
     - `resample`: how each object is drawn anew, with the particles that its weight earns.
-    - `resample_undetected`: the same for component 0; by default its derivative is unbiased.
 
     Raises `ValueError` on islands, for `slots`, and without slots for the objects.
     """
@@ -88,11 +87,8 @@ class Associate(AbstractWrapper):
     undetected_particles: Count = eqx.field(static=True, default=400, kw_only=True)
     least_existence: Share = eqx.field(static=True, default=1e-4, kw_only=True)
     resample: AbstractResampling = eqx.field(default=Resample(), kw_only=True)
-    resample_undetected: AbstractResampling = eqx.field(
-        default=Resample(gradient="stop"), kw_only=True
-    )
 
-    holds = ("resample", "resample_undetected")
+    holds = ("resample",)
     approximate = True
     weighs = True
     keeps_mass = False
@@ -120,7 +116,6 @@ class Associate(AbstractWrapper):
         if num_particles < least:
             which = f"is less than {least}, {size} undetected_particles and one for each object"
             raise ValueError(f"num_particles: {num_particles} {which}")
-        self.resample_undetected.check(now, size, 1)
         self.resample.check(now, num_particles - size, num_components - 1)
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
@@ -140,12 +135,11 @@ class Associate(AbstractWrapper):
     ) -> _Intensity:
         """The intensity before the scan: of survivors and new objects."""
         size, number = self.undetected_particles, mixture.memory[TARGETS]["number"]
-        weights = mixture.weights * model.survival(mixture.particles)
-        is_undetected = mixture.component_indicators == 0
+        masses = number * mixture.weights * model.survival(mixture.particles)
+        undetected = jnp.where(mixture.component_indicators == 0, masses, 0.0)
         # In the first step these fill all slots, of which the first ones stand for all.
-        first = jnp.where(is_undetected, weights, 0.0)
-        share = jnp.sum(first) / jnp.maximum(jnp.sum(first[:size]), jnp.finfo(first.dtype).tiny)
-        rest = jnp.where(is_undetected, 0.0, weights)[size:]
+        tiny = jnp.finfo(masses.dtype).tiny
+        share = jnp.sum(undetected) / jnp.maximum(jnp.sum(undetected[:size]), tiny)
         rate = jnp.broadcast_to(model.birth.rate / size, (size,))
 
         def joined(old: Array, new: Array) -> Array:
@@ -153,7 +147,7 @@ class Associate(AbstractWrapper):
 
         return _Intensity(
             jax.tree.map(joined, mixture.particles, model.birth.sample(key, size)),
-            jnp.concatenate([number * share * first[:size], rate, number * rest]),
+            jnp.concatenate([share * undetected[:size], rate, (masses - undetected)[size:]]),
             jnp.maximum(mixture.component_indicators[size:] - 1, 0),
             2 * size,
             mixture.num_components - 1,
@@ -173,11 +167,11 @@ class Associate(AbstractWrapper):
         sensor, first = model.sensors[number], before.num_undetected
         log_odds, detection = sensor.log_odds(scan, before.states), sensor.detection(before.states)
         born, log_born = self._born(key_born, model, scan, number)
-        highest = jnp.maximum(jnp.max(log_odds, axis=0), jnp.max(log_born, axis=1, initial=0.0))
+        highest = jnp.maximum(jnp.max(log_odds, axis=0), jnp.max(log_born, axis=1))
         units = jax.lax.stop_gradient(jnp.maximum(highest, 0.0))
         likely = (before.masses * detection)[:, None] * exp(log_odds - units[None])
-        detectable = likely[: first // 2] if born else likely[:first]
-        starts = jnp.concatenate([detectable.T, exp(log_born - units[:, None])], axis=1)
+        own = first // 2  # the others are new ones, which are proposed at the measurements
+        starts = jnp.concatenate([likely[:own].T, exp(log_born - units[:, None])], axis=1)
 
         pairs, unseen = before.sums(likely), before.masses * (1 - detection)
         missed = before.sums(unseen) + jnp.maximum(1 - before.sums(before.masses), 0.0)
@@ -190,25 +184,20 @@ class Associate(AbstractWrapper):
         log_evidence = association.log_total + jnp.sum(units)
         log_evidence -= jnp.sum((before.masses * detection)[:first])
 
-        # New objects: particles drawn with equal shares of the probability.
-        size, num_rows = self.particles_per_birth, len(totals)
-        drawn = _drawn_in_rows(key_drawn, starts, size)
-        chosen = jnp.take_along_axis(starts, drawn, axis=1)
-        equal = jax.lax.stop_gradient(jnp.broadcast_to(totals[:, None], drawn.shape))
-        ratios = chosen / jax.lax.stop_gradient(jnp.where(chosen > 0, chosen, 1.0))
-        shares = add_gradient(equal, equal * ratios)  # of the one drawn, as `Resample` has it
-        new_masses = shares / association.column_sums[:, None] / size
-        places, own = jnp.arange(num_rows, dtype=jnp.int32)[:, None], detectable.shape[0]
+        num_rows, size = len(totals), self.particles_per_birth
+        drawn, shares = _redrawn(key_drawn, starts, size)
+        new_masses = shares / association.column_sums[:, None]
+        places = jnp.arange(num_rows, dtype=jnp.int32)[:, None]
         offsets = len(masses) + places * size - own
         drawn = jnp.where(drawn < own, drawn, drawn + offsets).reshape(-1)
 
-        def joined(old: Array, *born: Array) -> Array:
-            every = jnp.concatenate([old, *(leaf.reshape(-1, *old.shape[1:]) for leaf in born)])
+        def joined(old: Array, born: Array) -> Array:
+            every = jnp.concatenate([old, born.reshape(-1, *old.shape[1:])])
             return jnp.concatenate([old, take(every, drawn)])
 
         new_owners = jnp.repeat(before.num_objects + places[:, 0], size)
         return before._replace(
-            states=jax.tree.map(joined, before.states, *born),
+            states=jax.tree.map(joined, before.states, born),
             masses=jnp.concatenate([masses, new_masses.reshape(-1)]),
             owners=jnp.concatenate([before.owners, new_owners]),
             num_objects=before.num_objects + num_rows,
@@ -217,29 +206,23 @@ class Associate(AbstractWrapper):
 
     def _born(
         self, key: Key[Array, ""], model: TargetsModel, scan: PyTree, number: int
-    ) -> tuple[tuple[PyTree, ...], Float[Array, "k b"]]:
+    ) -> tuple[PyTree, Float[Array, "k b"]]:
         """States proposed at each measurement, and log of the mass of each as that measurement's.
 
-        Over that of clutter. No states where nothing is proposed.
+        Over that of clutter.
         """
         size, sensor, is_there = self.particles_per_birth, model.sensors[number], measured(scan)
 
-        def propose(key: Key[Array, ""], measurement: PyTree) -> tuple | None:
-            proposed = model.birth.propose(key, measurement, size, number)
-            if proposed is None:
-                return None
-            states, log_masses = proposed
+        def propose(key: Key[Array, ""], measurement: PyTree) -> tuple:
+            states, log_masses = model.birth.propose(key, measurement, size, number)
             one = jax.tree.map(lambda leaf: leaf[None], measurement)
             log_masses += sensor.log_odds(one, states)[:, 0] + jnp.log(sensor.detection(states))
             for earlier in model.sensors[:number]:
                 log_masses += jnp.log1p(-earlier.detection(states))
-            return states, log_masses
+            return states, log_masses + jnp.log(model.birth.rate / size)
 
-        born = jax.vmap(propose)(split(key, is_there.shape[0]), filled(scan))
-        if born is None:
-            return (), jnp.zeros((is_there.shape[0], 0))
-        log_masses = born[1] + jnp.log(model.birth.rate / size)
-        return (born[0],), jnp.where(is_there[:, None], log_masses, -jnp.inf)
+        states, log_masses = jax.vmap(propose)(split(key, is_there.shape[0]), filled(scan))
+        return states, jnp.where(is_there[:, None], log_masses, -jnp.inf)
 
     def _told_apart(
         self, memory: dict[str, Array], intensity: _Intensity, most: int
@@ -267,45 +250,51 @@ class Associate(AbstractWrapper):
         self, key: Key[Array, ""], mixture: ParticleMixture, intensity: _Intensity
     ) -> ParticleMixture:
         """The mixture's slots drawn from all particles, and the memory of the step."""
-        n, most, size = mixture.num_particles, mixture.num_components - 1, self.undetected_particles
+        size, most = self.undetected_particles, mixture.num_components - 1
+        rest = mixture.num_particles - size
         of_each, memory = self._told_apart(mixture.memory[TARGETS], intensity, most)
-        log_weights = log_or_nothing(intensity.masses) - log_or_nothing(memory["number"])
         key_first, key_rest = split(key, 2)
+        undetected = jnp.where(of_each == 0, intensity.masses, 0.0)
+        (drawn,), (masses,) = _redrawn(key_first, undetected[None], size)
+        objects = ParticleMixture(
+            particles=intensity.states,
+            log_weights=log_or_nothing(jnp.where(of_each > 0, intensity.masses, 0.0)),
+            component_indicators=of_each,
+            ancestor_indices=jnp.zeros_like(of_each),
+            num_components=most + 1,
+            usable_slots=jnp.asarray(rest, jnp.int32),
+        )
+        objects = self.resample.resample(key_rest, objects)
 
-        def drawn(
-            key: Key[Array, ""], move: AbstractResampling, is_of: Array, most: int, size: int
-        ) -> ParticleMixture:
-            wide = ParticleMixture(
-                particles=intensity.states,
-                log_weights=jnp.where(is_of, log_weights, -jnp.inf),
-                component_indicators=jnp.where(is_of, of_each, 0),
-                ancestor_indices=jnp.zeros_like(of_each),
-                num_components=most,
-                usable_slots=jnp.asarray(size, jnp.int32),
-            )
-            return move.resample(key, wide).map_slots(lambda leaf: leaf[:n])
+        def joined(first: Array, others: Array) -> Array:
+            return jnp.concatenate([first, others[:rest]])
 
-        undetected = drawn(key_first, self.resample_undetected, of_each == 0, 1, size)
-        objects = drawn(key_rest, self.resample, of_each > 0, most + 1, n - size)
-        every = undetected.joined(objects)
+        first = jax.tree.map(lambda leaf: take(leaf, drawn), intensity.states)
+        log_masses = joined(log_or_nothing(masses), objects.log_weights)
         return mixture.replace(
-            particles=every.particles,
-            log_weights=every.log_weights,
-            component_indicators=every.component_indicators,
+            particles=jax.tree.map(joined, first, objects.particles),
+            log_weights=log_masses - log_or_nothing(memory["number"]),
+            component_indicators=joined(jnp.zeros_like(drawn), objects.component_indicators),
             ancestor_indices=no_ancestors(mixture),
             log_scale=mixture.log_scale + intensity.log_evidence,
             memory=mixture.memory | {TARGETS: memory},
         )
 
 
-def _drawn_in_rows(
-    key: Key[Array, ""], weights: Float[Array, "k n"], number: int
-) -> Int[Array, "k number"]:
-    """So many columns of each row in proportion to its weights, systematically."""
-    upto = jnp.cumsum(jax.lax.stop_gradient(weights), axis=1)
-    first = uniform(key, (len(upto), 1), upto.dtype)
-    shares = (jnp.arange(number, dtype=upto.dtype)[None] + first) / number
-    shares *= 1 - jnp.finfo(upto.dtype).eps  # the last one is below the total, and has weight
+def _redrawn(
+    key: Key[Array, ""], masses: Float[Array, "k n"], number: int
+) -> tuple[Int[Array, "k number"], Float[Array, "k number"]]:
+    """So many columns of each row, drawn systematically by its masses, and an equal share of each.
+
+    The derivative of a share is that of the mass it was drawn by, as `Resample` has it.
+    """
+    upto = jnp.cumsum(jax.lax.stop_gradient(masses), axis=1)
+    points = jnp.arange(number, dtype=upto.dtype)[None] + uniform(key, (len(upto), 1), upto.dtype)
+    points *= (1 - jnp.finfo(upto.dtype).eps) / number  # the last one is below the total
     find = jax.vmap(lambda upto, points: jnp.searchsorted(upto, points, side="right"))
-    places = find(upto, shares * upto[:, -1:]).astype(jnp.int32)
-    return jnp.minimum(places, weights.shape[1] - 1)
+    places = find(upto, points * upto[:, -1:]).astype(jnp.int32)
+    places = jnp.minimum(places, masses.shape[1] - 1)
+    chosen = jnp.take_along_axis(masses, places, axis=1)
+    equal = jnp.broadcast_to(upto[:, -1:] / number, chosen.shape)
+    ratios = chosen / jax.lax.stop_gradient(jnp.where(chosen > 0, chosen, 1.0))
+    return places, add_gradient(equal, equal * ratios)

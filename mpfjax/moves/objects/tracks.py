@@ -21,6 +21,7 @@ class Targets(NamedTuple):
     - `means`, `covariances`: of its state; the state's own form, NaN where there is
       none, and (M, d, d) of the flat one.
     - `quantiles`: of each number of the flattened state, (M, q, d); None where none are asked for.
+    - `number`: the median of how many there are, whose mean error is least.
     - `expected_number`: of all objects; `undetected` of them have not been revealed yet.
     - `crowded_out`: how many objects to expect that found no component in this step.
     """
@@ -30,6 +31,7 @@ class Targets(NamedTuple):
     means: PyTree
     covariances: Float[Array, "m d d"]
     quantiles: Float[Array, "m q d"] | None
+    number: Int[Array, ""]
     expected_number: Float[Array, ""]
     undetected: Float[Array, ""]
     crowded_out: Float[Array, ""]
@@ -47,6 +49,7 @@ def targets(mixture: ParticleMixture, q: Sequence[float] = ()) -> Targets:
         raise ValueError("mixture: it is of no bernoulli_filter")
     memory, values = mixture.memory[TARGETS], flatten_states(mixture.particles)
     existence = memory["number"] * mixture.mixture_weights
+    of_each = jnp.minimum(existence[1:], 1.0)
 
     def of_component(m: Int[Array, ""]) -> Float[Array, "q d"]:
         is_own = mixture.component_indicators == m
@@ -58,10 +61,11 @@ def targets(mixture: ParticleMixture, q: Sequence[float] = ()) -> Targets:
     means = jax.tree.map(lambda leaf: leaf[1:], mixture.component_means())
     return Targets(
         labels=memory["labels"][1:],
-        existence=jnp.minimum(existence[1:], 1.0),
+        existence=of_each,
         means=means,
         covariances=mixture.component_covariances()[1:],
         quantiles=jax.vmap(of_component)(places) if len(q) else None,
+        number=jnp.sum(jnp.cumsum(number_distribution(of_each)) < 0.5),
         expected_number=memory["number"],
         undetected=existence[0],
         crowded_out=memory["crowded_out"],
