@@ -53,8 +53,10 @@ _NOT_WITH = {
         "offline",
         "lost_seconds",
         "classes",
+        "point_deviation",
     ),
-    "detect": ("min_score", "classes"),
+    "detect": ("min_score", "classes", "point_deviation"),
+    "point_deviation": ("truth",),
 }
 
 
@@ -110,6 +112,12 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
     track.add_argument(
         "--classes", action="store_true", help="the eighth column of detections is their class"
     )
+    track.add_argument(
+        "--point-deviation",
+        type=positive,
+        metavar="S",
+        help="detections are points, rows frame,id,x,y,score,class, with errors of this deviation",
+    )
     track.add_argument("--min-score", type=finite, metavar="S", help="leave out weaker detections")
     track.add_argument(
         "--max-objects", type=whole(1, 1024), metavar="M", help="room for objects at a time"
@@ -159,10 +167,11 @@ def _check(track: argparse.ArgumentParser, options: argparse.Namespace) -> None:
         track.error("one of the arguments --detections --detect --box is required")
     if options.detect and by_pixels:
         track.error("argument --camera-motion pixels: not allowed with --detect")
-    found_by = "box" if options.box else "detect" if options.detect else ""
-    for name in _NOT_WITH.get(found_by, ()):
-        if getattr(options, name) not in (None, False):
-            track.error(f"argument --{name.replace('_', '-')}: not allowed with --{found_by}")
+    for given, others in _NOT_WITH.items():
+        for name in others if getattr(options, given) else ():
+            if getattr(options, name) not in (None, False):
+                names = (each.replace("_", "-") for each in (name, given))
+                track.error("argument --{}: not allowed with --{}".format(*names))
 
 
 def _existing(text: str) -> Path:
@@ -184,21 +193,23 @@ def open_source(options: argparse.Namespace) -> Source:
         written,
         {"SOURCE": path, "--detections": detections, "--truth": options.truth},
     )
-    rows = None
+    rows, points = None, options.point_deviation is not None
     if detections is not None:
-        rows = box_files.read_detections(detections, with_classes=options.classes)
+        kinds = {"with_classes": options.classes, "points": points}
+        rows = box_files.read_detections(detections, **kinds)
     folder, info = path, SequenceInfo()
     if not has_pixels:
         folder = path if path.is_dir() else sequence_of(path) or path
         info = read_sequence_info(folder)
-    truth, end = find_truth(folder, options.truth, first, last), last
+    truth, end = None if points else find_truth(folder, options.truth, first, last), last
     if rows is not None and not has_pixels:
         known = [rows[:, :6], *([] if truth is None else [truth.objects])]
         held = last_frame(info, *known)
         if last is None and info.length is None:
             begin = first if options.frames else None
             rate = options.fps or info.frame_rate or 25
-            first = first_step(Rows(np.concatenate(known)), begin, rate)
+            of_rows = Rows(np.concatenate(known), coordinates=2 if points else 4)
+            first = first_step(of_rows, begin, rate)
         last = end = min(last or held, held)
         if last < first:
             raise ValueError(f"SOURCE: {path} holds {held} frames, and no frame {first}")

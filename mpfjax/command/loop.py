@@ -56,7 +56,8 @@ class Results:
 
     def add(self, tracks: Tracks) -> np.ndarray:
         """Keep a frame's tracks, and return its rows."""
-        rows = online_rows(self.source.first + self.num_frames, tracks, described=True)
+        number = self.source.first + self.num_frames
+        rows = _with_sizes(online_rows(number, tracks, described=True))
         self.rows.append(rows)
         if self.options.offline:
             self.kept.append(tracks)
@@ -68,7 +69,7 @@ class Results:
     def all_rows(self) -> np.ndarray:
         """The rows of tracks.txt, with scores and classes."""
         if self.options.offline:
-            return offline_rows(self.kept, self.source.first, described=True)
+            return _with_sizes(offline_rows(self.kept, self.source.first, described=True))
         return np.concatenate([np.zeros((0, 8)), *self.rows])
 
     def summary(self) -> dict[str, Any]:
@@ -86,6 +87,11 @@ class Results:
         }
         first = self.source.first
         return summary | scores_of(rows[:, :6], self.source.truth, first, first + n - 1, self.drawn)
+
+
+def _with_sizes(rows: np.ndarray) -> np.ndarray:
+    """Rows of boxes as they are; those of points with a width and a height of 0."""
+    return rows if rows.shape[1] == 8 else np.insert(rows, [4, 4], 0.0, axis=1)
 
 
 def scores_of(
@@ -157,11 +163,15 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
             raise ValueError(f"--box: frame {source.first}, in which they are, cannot be decoded")
         boxes = results.drawn = read_boxes(options, still)
         return lambda stills: follow_boxes(stills or (), boxes, key=key)
-    rows = None if source.rows is None else Rows(source.rows, last=source.last)
+    rows, deviation = None, options.point_deviation
+    if source.rows is not None:
+        rows = Rows(source.rows, last=source.last, coordinates=4 if deviation is None else 2)
     room = LEAST_ROOM if rows is None else rows.most_objects()
-    rate = source.frames_per_second
     tracker = ObjectTracker(
-        options.max_objects or room, frames_per_second=rate, lost_seconds=options.lost_seconds
+        options.max_objects or room,
+        frames_per_second=source.frames_per_second,
+        lost_seconds=options.lost_seconds,
+        point_deviation=deviation,
     )
     detector = BackgroundSubtraction() if options.detect else None
     if options.camera_motion == "pixels":

@@ -418,6 +418,28 @@ def test_classes_scores_and_the_seconds_of_the_lost_go_through_to_what_is_writte
     assert numbers == {"short": 2, "long": 1}
 
 
+def test_points_are_tracked_and_written_without_a_size(tmp_path, capsys):
+    """Two that cross at 30 deviations; the score and the class of each point go with it."""
+    rng, t = np.random.default_rng(0), np.arange(1, 31)
+    rows = [
+        np.c_[t, 0 * t - 1, 100 + step * (t - 15), np.full(30, y), score + 0 * t, kind + 0 * t]
+        for step, y, score, kind in ((9, 0, 0.5, 1), (-9, 60, 0.75, 2))
+    ]
+    rows = np.concatenate(rows)[np.argsort(np.tile(t, 2), kind="stable")]
+    rows[:, 2:4] += 2 * rng.standard_normal((60, 2))
+    found = write_detections(tmp_path / "plots.txt", rows)
+    given = "--point-deviation", 2
+    assert run(found, *given, "--fps", 1, "--offline", "--out", tmp_path / "out") == 0
+    written = np.loadtxt(tmp_path / "out" / "tracks.txt", delimiter=",")
+    assert written.shape == (60, 10)
+    assert not written[:, 4:6].any()
+    np.testing.assert_array_equal(written[:, 6:8], rows[:, 4:])
+    np.testing.assert_array_equal(written[:, 1], rows[:, 5])
+    assert np.abs(written[:, 2:4] - rows[:, 2:4]).max() < 8
+    assert run(found, *given, "--truth", found, "--out", tmp_path / "out") == 2
+    assert "--truth: not allowed with --point-deviation" in capsys.readouterr().err
+
+
 def test_frames_with_more_objects_than_room_are_counted(tmp_path, capsys):
     assert Rows(still_objects(150, 3)).most_objects() >= 200
     path = write_detections(tmp_path / "crowd.txt", still_objects(5, 4))
