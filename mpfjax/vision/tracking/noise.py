@@ -8,7 +8,8 @@ from scipy.special import softmax
 
 from mpfjax.vision.tracking.gaussian import Gaussian, units
 
-# Candidate deviations of detections, places and velocities, in boxes, wider than real ones.
+# Candidate deviations of detections, places and velocities, in boxes, wider than real ones. They
+# and the priors are for 25 frames a second.
 _ERRORS = (0.01, 0.02, 0.04, 0.08, 0.16)
 _PLACES = (0.005, 0.015, 0.045)
 _VELOCITIES = (0.001, 0.005, 0.025, 0.1)
@@ -18,8 +19,11 @@ _PRIOR = np.array(
     [(0.03, 0.03, 0.04, 0.04), (0.02, 0.015, 0.03, 0.02), (0.01, 0.006, 0.003, 0.003)]
 )
 _DOUBTS = np.array([0.7, 0.7, 0.9])
-# The deviation of a newborn object's velocity at 25 frames a second, and at most times as large.
+# The deviation of a newborn object's velocity; how many times longer a frame may count as.
 _SPEED, _MOST = np.array([0.1, 0.05, 0.05, 0.03]), 2.5
+# Errors are the same at any rate. The noises are those of a random walk of places, and of one of
+# velocities, which are by frames.
+_POWERS = np.array([0.0, 0.5, 1.5])
 # Of points, in deviations of their errors, which are given: what moves steadily has nearly no noise
 # of its place, and what walks at random much.
 _POINT_PLACES, _POINT_VELOCITIES = (0.01, 0.1, 0.4, 1.6), (0.003, 0.03, 0.15, 0.8, 4.0)
@@ -58,6 +62,7 @@ class NoiseState(NamedTuple):
     - `evidence`: (L, k), discounted log-likelihoods of all objects together.
     - `squares`, `newborn`: sum of squared velocities of newborn objects, in boxes; their number.
     - `start`: the prior deviation of a newborn object's velocity.
+    - `scale`: (3,), of the candidates, at this frame rate.
     - `noises`: what is believed.
     """
 
@@ -66,19 +71,23 @@ class NoiseState(NamedTuple):
     squares: Float[np.ndarray, " k"]
     newborn: float
     start: Float[np.ndarray, " k"]
+    scale: Float[np.ndarray, "3"]
     noises: Noises
 
     @classmethod
     def initial(cls, frames_per_second: float, coordinates: int = 4) -> "NoiseState":
-        """Before any frame: the means of the priors. New objects move further at a lower rate."""
+        """Before any frame: the means of the priors. Boxes move less evenly at a lower rate."""
         prior, _, speed = _BEFORE[coordinates]
-        start = min(25 / frames_per_second, _MOST) * speed
-        shape, noises = (_RIVALS[coordinates].shape[2], coordinates), Noises(*prior, speed=start)
-        return cls(Gaussian.none(*shape), np.zeros(shape), 0.0 * start, 0.0, start, noises)
+        longer = min(25 / frames_per_second, _MOST)
+        start, scale = longer * speed, longer ** (_POWERS if coordinates == 4 else 0 * _POWERS)
+        noises = Noises(*(scale[:, None] * prior), speed=start)
+        none = np.zeros((_RIVALS[coordinates].shape[2], coordinates))
+        return cls(Gaussian.none(*none.shape), none, 0.0 * start, 0.0, start, scale, noises)
 
     def predicted(self, frames: float) -> "NoiseState":
         """Every object under every candidate, later; each candidate has its own units."""
-        _, place, velocity = _RIVALS[self.evidence.shape[1]]
+        scale = self.scale[:, None, None, None]
+        _, place, velocity = scale * _RIVALS[self.evidence.shape[1]]
         moments = self.moments.predicted(place, velocity, self.moments.unit, frames)
         return self._replace(moments=moments)
 
@@ -117,8 +126,9 @@ class NoiseState(NamedTuple):
         logs = np.log(_RIVALS[evidence.shape[1]][:, 0])
         away = (logs - np.log(prior)[:, None]) / doubts[:, None, None]
         believed = softmax(evidence - 0.5 * np.sum(away**2, axis=0), axis=0)
-        noises = Noises(*np.exp(np.sum(believed[None] * logs, axis=1)), speed=speed)
-        return NoiseState(self.moments, evidence, squares, newborn, self.start, noises)
+        means = self.scale[:, None] * np.exp(np.sum(believed[None] * logs, axis=1))
+        told = evidence, squares, newborn, self.start, self.scale
+        return NoiseState(self.moments, *told, Noises(*means, speed=speed))
 
     def begun(self, places: Float[np.ndarray, "n k"], speed: Float[np.ndarray, " k"]) -> Gaussian:
         """New objects under every candidate."""
