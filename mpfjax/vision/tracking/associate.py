@@ -6,7 +6,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
 from mpfjax.moves.objects.association import settled_replies
-from mpfjax.vision.tracking.gaussian import Gaussian, along
+from mpfjax.vision.tracking.gaussian import Gaussian
 
 _FREEDOM = 4.0  # degrees, of Student's distribution of gaps
 _COLOUR_COST, _UNDECIDED = 14.0, 0.25  # of B², and where it is evidence neither for nor against
@@ -54,21 +54,17 @@ def mahalanobis(
     errors: Float[np.ndarray, " k"],
     places: Float[np.ndarray, "d k"],
     beside: Float[np.ndarray, "m d"],
-    slack: Float[np.ndarray, "2"] | None = None,
     others: float = 0.0,
 ) -> Float[np.ndarray, "m d"]:
     """-2 log p of each detection under each prediction, up to a constant, with lengths in boxes.
 
     Student's density with ν = 4 degrees of freedom: (ν + 4) log(1 + |d - μ|² / ν) + log |S|. What
     has been unseen for long has a large |S|, and less of a claim. `beside`: what pairs cost beside
-    distance, added to it. `slack`: deviations of x and y, in pixels, to be added to those of all
-    predictions. `others`: the cost that stands for the density of detections of nobody. Pairs that
-    x alone puts above a cost of 0 cost infinitely.
+    distance, added to it. `others`: the cost that stands for the density of detections of nobody.
+    Pairs that x alone puts above a cost of 0 cost infinitely.
     """
     unit, place = predicted.unit, predicted.place
     total = predicted.var_place + (unit * errors) ** 2
-    if slack is not None:
-        total = total + along(place, slack) ** 2
     power = _FREEDOM + total.shape[1]
     volumes = np.minimum(np.sum(np.log(total / unit**2), axis=1) + others, _WIDEST)
     most = _FREEDOM * np.expm1((-volumes - np.min(beside, initial=0.0)) / power)

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mpfjax.vision.tracking.associate import argmax_pairs, mahalanobis
 from mpfjax.vision.tracking.gaussian import Gaussian
@@ -81,26 +81,27 @@ def jolted(
     places: Float[np.ndarray, "d 4"],
     unlike: Float[np.ndarray, "m d"],
     seen: Int[np.ndarray, " m"],
+    near: Bool[np.ndarray, " m"],
 ) -> Float[np.ndarray, "2"]:
     """The shift of a jolt that leaves most objects without a detection, zero if there was none.
 
-    `unlike` is infinite where the two are no pair, and `seen` is 0 for what was not seen lately.
-    Where at most half of the objects have a detection near them, the shifts that bring one of the
-    eight longest seen to one of the two detections next to it are tried: a camera moves all by the
-    same. The one that explains most counts, if that is three quarters of them, and two more than
-    without it.
+    `unlike` is infinite where the two are no pair, `seen` is 0 for what was not seen lately, and
+    `near` says which have a detection near them. Where at most half of the objects have, the shifts
+    that bring one of the eight longest seen to one of the two detections next to it are tried: a
+    camera moves all by the same. The one that explains most counts, if that is three quarters of
+    them, and two more than without it.
     """
     rows = np.flatnonzero(seen)
     rows = rows[np.argsort(-seen[rows], kind="stable")]
+    still = int(near[rows].sum())
+    if 2 * still > len(rows) or len(rows) < still + 2:
+        return np.zeros(2)
     objects, unlike = predicted.at(rows), unlike[rows]
 
     def explained(shift: np.ndarray) -> int:
         cost = mahalanobis(objects.shifted(shift), errors, places, unlike)
         return int((cost < 0).any(axis=1).sum())
 
-    still = explained(np.zeros(2))
-    if 2 * still > len(rows) or len(rows) < still + 2:
-        return np.zeros(2)
     leaders = slice(_LEADERS)
     gaps = places[None, :, :2] - objects.place[leaders, None, :2]
     far = np.sum((gaps / objects.unit[leaders, None, :2]) ** 2, axis=2) + unlike[leaders]

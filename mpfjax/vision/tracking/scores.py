@@ -29,8 +29,8 @@ class ScoreState(NamedTuple):
 
     - `recent`: the latest scores, at most 8192.
     - `weak`, `strong`: the least score that counts, and from which on a detection is strong.
-    - `boxes`: (c, 4), the last box of each living chain, or (c, 2), moved with the camera;
-      `unseen`: frames with detections since its last one.
+    - `boxes`: (c, 4), the last box of each living chain, or (c, 2), moved with the camera; `steps`:
+      (c, 2), by how far it moved in a frame; `unseen`: frames with detections since its last one.
     - `age`: frames since its first detection, which counts as one; `sure`: whether it has proved to
       be an object; `pending`: (c, bins), its detections by share while that is not decided.
     - `good`, `bad`: (bins,), detections of chains that proved to be objects, and of chains that
@@ -41,6 +41,7 @@ class ScoreState(NamedTuple):
     weak: float
     strong: float
     boxes: Float[np.ndarray, "c k"]
+    steps: Float[np.ndarray, "c 2"]
     unseen: Int[np.ndarray, " c"]
     age: Float[np.ndarray, " c"]
     sure: Bool[np.ndarray, " c"]
@@ -52,7 +53,8 @@ class ScoreState(NamedTuple):
     def initial(cls, coordinates: int = 4) -> "ScoreState":
         """No score seen yet, and no chain."""
         none, bins = np.zeros(0, int), np.zeros(_BINS)
-        chains = np.zeros((0, coordinates)), none, 0.0 * none, none > 0, np.zeros((0, _BINS))
+        boxes, steps, pending = (np.zeros((0, width)) for width in (coordinates, 2, _BINS))
+        chains = boxes, steps, none, 0.0 * none, none > 0, pending
         return cls(np.zeros(0), 0.0, 0.0, *chains, bins, bins)
 
     def after(
@@ -105,12 +107,19 @@ class ScoreState(NamedTuple):
         variance: float,
     ) -> "ScoreState":
         """The chains after a frame whose detections have these shares of a sure score."""
-        at_rest, in_motion = (overlap(boxes, found, variance) for boxes in (self.boxes, moved))
-        overlaps = np.maximum(at_rest, in_motion)
-        rows = argmax_pairs(np.where(overlaps > _SAME, overlaps, 0.0))
-        seen, free = rows >= 0, np.ones(len(found), bool)
-        free[rows[seen]] = False
-        new = np.flatnonzero(free)
+        since = frames * (1 + self.unseen[:, None])
+        ahead = moved + np.pad(since * self.steps, ((0, 0), (0, moved.shape[1] - 2)))
+        at_rest, in_motion, stepped = (
+            overlap(boxes, found, variance) for boxes in (self.boxes, moved, ahead)
+        )
+        near = np.maximum(at_rest, in_motion)
+        # At a low rate what is fast leaves its last box; elsewhere steps are mostly errors.
+        stepped = np.where(stepped > _SAME, stepped, 0.0)
+        rows = argmax_pairs(np.where(near > _SAME, 1 + near, stepped))
+        seen = rows >= 0
+        held, new = np.flatnonzero(seen), np.setdiff1d(np.arange(len(found)), rows)
+        steps = np.concatenate([self.steps, np.zeros((len(new), 2))])
+        steps[held] = (found[rows[held]] - moved[held])[:, :2] / since[held]
         # New chains come after the others.
         rows, seen = np.append(rows, new), np.append(seen, new >= 0)
         none = np.zeros(len(new), int)
@@ -126,10 +135,10 @@ class ScoreState(NamedTuple):
         unseen = np.where(seen, 0, np.append(self.unseen, none) + 1)
         ended = unseen >= _GONE
         good, bad = pending[sure].sum(axis=0), pending[ended & ~sure].sum(axis=0)
-        chains = boxes, unseen, age, sure, np.where(sure[:, None], 0.0, pending)
-        boxes, unseen, age, sure, pending = (rows[~ended] for rows in chains)
+        chains = boxes, steps, unseen, age, sure, np.where(sure[:, None], 0.0, pending)
+        boxes, steps, unseen, age, sure, pending = (rows[~ended] for rows in chains)
         return self._replace(
-            boxes=boxes, unseen=unseen, age=age, sure=sure, pending=pending,
+            boxes=boxes, steps=steps, unseen=unseen, age=age, sure=sure, pending=pending,
             good=KEPT * self.good + good, bad=KEPT * self.bad + bad,
         )  # fmt: skip
 

@@ -45,8 +45,9 @@ _YIELDING = 0.01  # of the claim of an object that takes only what others leave
 _BIRTH_OVERLAP = 0.5  # with an object or a stronger detection: it is one more box of the same
 _SAME = 0.5  # least overlap of a prediction that was right with the detection
 _CONTACT = 0.12  # an overlap from which on objects would learn each other's colours
-# Log odds that a point is an object's and not of nobody, to what confirms one; of a missing point.
-_POINT_ODDS, _MISSED = -np.log(10) - 3.0, -2.0
+# Before any point of its own an object has odds of 1 to 10, and odds of 20 to 1 confirm it; one
+# of its points in seven is missed.
+_POINT_ODDS, _MISSED = -np.log(10) - np.log(20), -np.log(7)
 _FIRST = 3  # strong detections of an object after which it teaches the noises
 
 
@@ -67,8 +68,10 @@ class ObjectTracker(Checked):
 
     Lengths are in boxes, so that nothing depends on the size of the frame or of the objects; with
     `point_deviation` in deviations of points. Who has which point is told by distance alone, and
-    by how densely points of nobody lie, which is learned; two that begin nearer than 3.5 deviations
-    are one until they part. Vectors beside boxes count by what their cosine distances have told.
+    by how densely points of nobody lie, which is learned. One new point in ten is of an object, and
+    one of an object's seven is missed: assumptions, and no measurements; odds of 20 to 1 confirm an
+    object. Two that begin nearer than 3.5 deviations are one until they part. Vectors beside boxes
+    count by what their cosine distances have told.
 
     - `max_objects`: M, how many objects there is room for.
     - `frames_per_second`: of the video.
@@ -389,15 +392,16 @@ def _with_camera(
     lives, errors = state.lives, state.noise.noises.errors
     known = motion is not None and bool(motion.known)
     seen = np.where(lives.confirmed & (lives.unseen == 0), lives.seen, 0)
-    counts = found.scores >= state.scores.weak
-    jolt = jolted(state.objects, errors, places[counts], unlike[:, counts], seen)
-    objects, camera = state.objects.shifted(jolt), state.camera
-    confirmed, strong = lives.confirmed, found.scores >= state.scores.strong
+    counts, strong = (found.scores >= least for least in (state.scores.weak, state.scores.strong))
+    cost = mahalanobis(state.objects, errors, places, unlike)
+    near = (cost[:, counts] < 0).any(axis=1)
+    jolt = jolted(state.objects, errors, places[counts], unlike[:, counts], seen, near)
+    objects, confirmed = state.objects.shifted(jolt), lives.confirmed
+    if jolt.any():
+        cost = mahalanobis(objects, errors, places, unlike)
     box = np.exp(objects.place[confirmed, 2:].sum(axis=0) / max(confirmed.sum(), 1))
-    slack = 2 * (camera.left if known else camera.deviations) * box
-    sure, detected = objects.at(confirmed), places[strong]
-    cost = mahalanobis(sure, errors, detected, unlike[np.ix_(confirmed, strong)], slack)
-    camera, shift = camera.after(sure, gone[confirmed] + jolt, known, cost, errors, detected, box)
+    told = gone[confirmed] + jolt, known, cost[np.ix_(confirmed, strong)], errors, places[strong]
+    camera, shift = state.camera.after(objects.at(confirmed), *told, box)
     shift = jolt + shift
     noise = state.noise._replace(moments=state.noise.moments.shifted(shift))
     objects = state.objects.shifted(shift)
