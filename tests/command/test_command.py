@@ -423,7 +423,7 @@ def test_points_are_tracked_and_written_without_a_size(tmp_path, capsys):
     rng, t = np.random.default_rng(0), np.arange(1, 31)
     rows = [
         np.c_[t, 0 * t - 1, 100 + step * (t - 15), np.full(30, y), score + 0 * t, kind + 0 * t]
-        for step, y, score, kind in ((9, 0, 0.5, 1), (-9, 60, 0.75, 2))
+        for step, y, score, kind in ((9, 0, 0.75, 1), (-9, 60, 0.5, 2))
     ]
     rows = np.concatenate(rows)[np.argsort(np.tile(t, 2), kind="stable")]
     rows[:, 2:4] += 2 * rng.standard_normal((60, 2))
