@@ -394,7 +394,7 @@ def _with_camera(
     seen = np.where(lives.confirmed & (lives.unseen == 0), lives.seen, 0)
     counts, strong = (found.scores >= least for least in (state.scores.weak, state.scores.strong))
     cost = mahalanobis(state.objects, errors, places, unlike)
-    near = (cost[:, counts] < 0).any(axis=1)
+    near = np.asarray(np.any(cost[:, counts] < 0, axis=1))
     jolt = jolted(state.objects, errors, places[counts], unlike[:, counts], seen, near)
     objects, confirmed = state.objects.shifted(jolt), lives.confirmed
     if jolt.any():
