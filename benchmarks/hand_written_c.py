@@ -131,7 +131,7 @@ def through_parts(job: Quadratic, num_particles: int) -> dict[int, Callable[[Any
 
     def draw(keys: Any) -> Any:
         """A filter without observations; the sum needs every particle."""
-        run = mpfjax.monte_carlo(keys, weighing, unseen, sums, missing="skip")
+        run = mpfjax.monte_carlo(keys, weighing, mpfjax.Series.skipping(unseen), sums)
         return jax.block_until_ready(run.collected)
 
     def weigh(keys: Any) -> Any:

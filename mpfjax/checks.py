@@ -388,6 +388,7 @@ def _bound(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict
 
 
 _signature = functools.cache(inspect.signature)
+_OF_SERIES = {"inputs": "Series(y, inputs=u)", "missing": "Series.skipping(y)"}
 
 
 def _misfit(signature: inspect.Signature, args: tuple[Any, ...], kwargs: dict[str, Any]) -> str:
@@ -400,6 +401,8 @@ def _misfit(signature: inspect.Signature, args: tuple[Any, ...], kwargs: dict[st
     for unknown in kwargs.keys() - names:
         close = difflib.get_close_matches(unknown, free, 1)
         said = f"did you mean {close[0]}?" if close else f"it takes {', '.join(names)}"
+        if "observations" in names and unknown in _OF_SERIES:
+            said = f"write observations={_OF_SERIES[unknown]}"
         return f"{unknown} is none of its arguments; {said}"
     if len(args) > len(by_place):
         by_name = ", ".join(names[len(by_place) :])

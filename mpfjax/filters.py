@@ -123,7 +123,9 @@ def mixture_particle_filter(
     - `regroup`: moves in the place of `Merge`, `Split` and `KMeans`, with features and thresholds
       of their own.
     - `regroup_every`: k where they run at every k-th step (see `Every`): take 1 where modes move
-      fast, or where a `Merge` counts frames with its `patience`.
+      fast, or where a `Merge` counts frames with its `patience`. The default, 3, loses nothing
+      here. That of `gaussian_mixture_particle_filter` is 1, as a component that comes to hold two
+      modes loses them at its next step.
     - `noise`: "rqmc" is `with_point_sets`: each component has a point set of its own, and the
       masses of modes are far more accurate. `with_lookahead` comes with it, unless there is a
       proposal or a conditionally linear model.
@@ -190,7 +192,10 @@ def gaussian_mixture_particle_filter(
     weighted by L (or L D / q). "predictive_gaussian": these particles only give the moments of
     the prediction (eqs. 12 and 13). New particles are drawn from its Gaussian, N(μ̄, Σ̄), and
     weighted by L, since the Gaussian cancels in eq. 8. That is one more approximation and one
-    more draw. The other arguments are those of `mixture_particle_filter`.
+    more draw. The other arguments are those of `mixture_particle_filter`. Components are regrouped
+    at every step: the Gaussian of one that holds two modes lies between them. With
+    `regroup_every=3` 12% of 400 runs lose a mode, with 1 one per cent (`python -m
+    benchmarks.score_vs_particles --filters gm_mpf --seeds 400 --particles 100`).
 
     The filter is an approximation, good where each mode is close to a Gaussian. Raises
     `ValueError` for another `importance`, and for "predictive_gaussian" with a `proposal`.

@@ -142,7 +142,7 @@ BOTH = eqx.tree_at(
 def test_what_is_missing_is_skipped_as_the_kalman_filter_does(model, linear, observations):
     filter, observations = mpfjax.particle_filter(model, 500), np.array(observations, np.float32)
     keys = jax.random.split(KEY, 400)
-    run = mpfjax.monte_carlo(keys, filter, observations, mean, missing="skip")
+    run = mpfjax.monte_carlo(keys, filter, mpfjax.Series.skipping(observations), mean)
     exact = kalman_filter(linear, mpfjax.Series.skipping(observations))
     ratios = ratios_to(exact, run)
     assert_unbiased(ratios, loosest=0.03)

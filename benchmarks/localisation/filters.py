@@ -122,11 +122,10 @@ def traced(mixture: mpfjax.ParticleMixture) -> tuple[Array, Array]:
 
 def run(name: str, model: Any, size: int, components: int, keys: Array, given: Any) -> Any:
     """Of each run and step on (observations, inputs): particles, log-weights, log Ẑ's increment."""
-    observations, inputs = given
     if name == PEER:
         return _through_blackjax(model, size)(keys, given)
     filter = FILTERS[name](model, size, components)
-    runs = mpfjax.monte_carlo(keys, filter, observations, traced, inputs=inputs)
+    runs = mpfjax.monte_carlo(keys, filter, mpfjax.Series(*given), traced)
     return *runs.collected, runs.log_likelihood_increments
 
 

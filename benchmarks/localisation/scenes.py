@@ -180,7 +180,7 @@ def drawn(
 
 def turtlebot(seed: int, steps: int | None) -> Scene:
     """TurtleBot3's world, nearly six-fold symmetric, and random drives of 50 steps."""
-    grid = robots.read_map(MAP, resolution=0.05, occupied_thresh=0.649, free_thresh=0.018)
+    grid = robots.read_map(MAP, resolution=0.05)
     rows, columns = np.nonzero(grid.free | grid.occupied)
     part = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     grid = robots.OccupancyGrid(grid.occupied[part], grid.free[part], resolution=0.05)
@@ -191,7 +191,7 @@ def turtlebot(seed: int, steps: int | None) -> Scene:
 def wander(model: robots.RobotModel, steps: int, rng: np.random.Generator) -> np.ndarray:
     """A random drive of .2 m a step that turns before walls."""
     cell, starts = model.grid.resolution, np.asarray(model.starts)
-    free = {(int(x), int(y)) for x, y in starts}
+    free = {(int(x), int(y)) for x, y in np.round(starts / cell)}
 
     def ahead(pose: np.ndarray, way: float) -> np.ndarray:
         return pose + way * np.array([np.cos(pose[2]), np.sin(pose[2]), 0])
@@ -199,7 +199,7 @@ def wander(model: robots.RobotModel, steps: int, rng: np.random.Generator) -> np
     def is_free(pose: np.ndarray) -> bool:
         return (int(pose[0] / cell), int(pose[1] / cell)) in free
 
-    pose = np.array([*(cell * (rng.choice(starts) + 0.5)), rng.uniform(-np.pi, np.pi)])
+    pose = np.array([*(rng.choice(starts) + cell / 2), rng.uniform(-np.pi, np.pi)])
     poses = [pose]
     for _ in range(steps):
         for spread in [0.15] * 3 + [2.0] * 60:

@@ -19,7 +19,8 @@ class Series(eqx.Module):
     """All that a filter is given at the steps 1, ..., t; every leaf has a leading axis t.
 
     Whatever takes observations takes either the arrays of y_1, ..., y_t, all of them finite
-    numbers, or a `Series`, which also says what is known beside them and which are missing.
+    numbers, or a `Series`, which also says what is known beside them and which are missing. In
+    `run_filter` alone `inputs=` and `missing=` are short for it.
     """
 
     observations: PyTree
@@ -47,13 +48,12 @@ class Series(eqx.Module):
         return jax.tree.leaves(self.observations)[0].shape[0]
 
 
-def as_series(data: PyTree, model: Any, inputs: PyTree = None, missing: str = "error") -> Series:
+def as_series(data: PyTree, model: Any) -> Series:
     """Observations, or a `Series`, as arrays; a `ValueError` for data that cannot be run.
 
-    In the result `present` is known, and None if no observation is missing. `inputs` and `missing`
-    are those of `run_filter`, for observations that are no `Series`.
+    In the result `present` is known, and None if no observation is missing.
     """
-    series = gathered(data, inputs, missing)
+    series = gathered(data)
     observations = as_arrays(series.observations)
     length = _length(observations, series.observations, "observations")
     present = present_steps(observations, series, refused_by(model))
@@ -61,7 +61,7 @@ def as_series(data: PyTree, model: Any, inputs: PyTree = None, missing: str = "e
 
 
 def gathered(data: PyTree, inputs: PyTree = None, missing: str = "error") -> Series:
-    """The data as a `Series`, unchecked."""
+    """The data as a `Series`, unchecked; `inputs` and `missing` are those of `run_filter`."""
     check(Literal["error", "skip"], missing=missing)
     if not isinstance(data, Series):
         return Series(data, inputs, skips_missing=missing == "skip")

@@ -25,7 +25,6 @@ from mpfjax.checks import (
     Fitting,
     NotNegative,
     Positive,
-    Share,
     check_shape,
     checked,
     optional,
@@ -34,37 +33,31 @@ from mpfjax.checks import (
 )
 from mpfjax.models.base import AbstractStateSpaceModel, replaced
 from mpfjax.models.gaussians import log_normal
-from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import normal, split, uniform
 
 Poses = Float[Array, "n 3"]
 Angles = Float[Array, " b"]
+Beams = Float[Array, "n b"]
+Cells = Shaped[Array, "rows columns"]
 Weight = Annotated[Float[Array, ""], NOT_NEGATIVE]
 Scale = Annotated[Float[Array, ""], POSITIVE]
 
-NOT_ON_THE_MAP = -1000.0
-"""log L of a pose in a cell of which the map says nothing. It is finite, so that a filter goes on
-whose robot drives beyond the map."""
 _AT_REST = 1e-4  # metres and radians: the least deviation of a step, so that each has a density
 _IN_PLACE = 0.01  # metres: a shorter step has no direction, and is a turn, as in AMCL
-
-
-def _to_floats(values: Any) -> Float[Array, "..."]:
-    """An array of floating point numbers of the default type."""
-    return jnp.asarray(values, default_float())
 
 
 class OccupancyGrid(Fitting):
     """A map of cells, each of which is occupied, free or unknown.
 
     - `occupied`: (rows, columns), from the lowest y up. At least one cell is.
-    - `free`: of the same shape; a cell that is neither is unknown. None takes all others.
+    - `free`: of the same shape; a cell that is neither is unknown, and one that is both occupied.
+      None takes all others.
     - `resolution`: the side of a cell in metres.
     - `origin`: (x, y) of the lower left corner of the cell [0, 0].
 
     `distances` are metres from each cell's centre to that of the nearest occupied one. Raises
-    `ValueError` for arrays that do not fit, a cell that is both, and a map without walls. Use
-    `read_map` for one in a file.
+    `ValueError` for arrays that do not fit, and a map without walls. Use `read_map` for one in a
+    file.
     """
 
     occupied: Bool[Array, "rows columns"]
@@ -78,19 +71,13 @@ class OccupancyGrid(Fitting):
         self, occupied: Any, free: Any = None, *, resolution: float, origin: Any = (0.0, 0.0)
     ) -> None:
         walls = np.asarray(occupied, bool)
+        if not walls.any():
+            raise ValueError("occupied: no cell is, so that nothing is at a distance")
         self.occupied = jnp.asarray(walls)
-        self.free = ~self.occupied if free is None else jnp.asarray(free, bool)
+        self.free = ~self.occupied if free is None else jnp.asarray(free, bool) & ~self.occupied
         self.resolution, self.table = resolution, None
         self.origin = to_numbers("origin")(origin)[:2]
-        distances = resolution * np.asarray(distance_transform_edt(~walls))
-        self.distances = _to_floats(distances)
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        if not self.occupied.any():
-            raise ValueError("occupied: no cell is, so that nothing is at a distance")
-        if (self.occupied & self.free).any():
-            raise ValueError("free: a cell that is free is also occupied")
+        self.distances = jnp.asarray(resolution * np.asarray(distance_transform_edt(~walls)), float)
 
     def cells(self, places: Float[Array, "*n 2"]) -> tuple[Array, Array, Array]:
         """Row and column of each place, or of the nearest cell, and whether it is on the map."""
@@ -102,26 +89,18 @@ class OccupancyGrid(Fitting):
         inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
         return jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1), inside
 
-    def at(
-        self, places: Float[Array, "*n 2"], values: Shaped[Array, "rows columns"], outside: Any
-    ) -> Shaped[Array, "*n"]:
+    def at(self, places: Float[Array, "*n 2"], values: Cells, outside: Any) -> Shaped[Array, "*n"]:
         """The value of the cell of each place, such as of `grid.free`, and another off the map."""
         rows, columns, inside = self.cells(places)
         return jnp.where(inside, values[rows, columns], outside)
 
-    def distance_at(self, places: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
-        """Metres to the nearest occupied cell; off the map by way of the nearest cell on it."""
-        rows, columns, inside = self.cells(places)
-        x = places[..., 0] - self.origin[0] - self.resolution * (columns.astype(places.dtype) + 0.5)
-        y = places[..., 1] - self.origin[1] - self.resolution * (rows.astype(places.dtype) + 0.5)
-        return self.distances[rows, columns] + jnp.where(inside, 0.0, jnp.sqrt(x**2 + y**2))
-
-    def ranges(self, poses: Poses, angles: Angles, max_range: float) -> Float[Array, "n b"]:
+    def ranges(self, poses: Poses, angles: Angles, max_range: float) -> Beams:
         """Metres from each pose to the first occupied cell along each angle, or `max_range`.
 
         The angles are counted from the heading. Each ray advances by the field of distances, which
         no wall is nearer than (sphere tracing: Hart 1996), and ends at most half a cell inside a
-        wall. Unknown cells do not stop it. With a table, see `tabulated`, a range is looked up.
+        wall. Unknown cells do not stop it, and beyond the map there is none. With a table, see
+        `tabulated`, a range is looked up.
         """
         if self.table is not None:
             rows, columns, _ = self.cells(poses[:, None, :2])
@@ -136,7 +115,7 @@ class OccupancyGrid(Fitting):
 
         def advance(carry: tuple[Array, Array]) -> tuple[Array, Array]:
             reach, _ = carry
-            gaps = self.distance_at(_ends(poses, angles, reach))
+            gaps = self.at(_ends(poses, angles, reach), self.distances, jnp.inf)
             steps = jnp.where(gaps > 0, jnp.maximum(gaps - diagonal, least), 0.0)
             farther = jnp.minimum(reach + steps, max_range)
             return farther, jnp.any(farther > reach)
@@ -150,11 +129,11 @@ class OccupancyGrid(Fitting):
         It has rows · columns · num_angles numbers. Use it with a `BeamModel`, whose step then takes
         a small part of the time.
         """
-        angles, cell = np.arange(num_angles) * (2 * np.pi / num_angles), self.resolution
-        rows, columns = np.indices(self.occupied.shape) + 0.5
-        x, y = self.origin[0] + cell * columns, self.origin[1] + cell * rows
-        poses, angles = _to_floats(np.stack([x, y, 0 * x], axis=-1)), _to_floats(angles)
-        farthest = cell * sum(self.occupied.shape)
+        angles = jnp.arange(num_angles, dtype=float) * (2 * np.pi / num_angles)
+        rows, columns = self.resolution * (np.indices(self.occupied.shape) + 0.5)
+        x, y = self.origin[0] + columns, self.origin[1] + rows
+        poses = jnp.asarray(np.stack([x, y, 0 * x], axis=-1), float)
+        farthest = self.resolution * sum(self.occupied.shape)
         found = jax.lax.map(lambda row: self.ranges(row, angles, farthest), poses)
         return replaced(self, table=found)
 
@@ -169,32 +148,27 @@ def _ends(poses: Poses, angles: Angles, ranges: Float[Array, "#n b"]) -> Float[A
 
 @checked
 def read_map(
-    path: str | Path,
-    *,
-    resolution: Positive | None = None,
-    origin: tuple[float, ...] = (0.0, 0.0),
-    negate: bool = False,
-    occupied_thresh: Share = 0.65,
-    free_thresh: Share = 0.196,
+    path: str | Path, *, resolution: Positive | None = None, origin: tuple[float, ...] = (0.0, 0.0)
 ) -> OccupancyGrid:
     """The map in ROS's `map.yaml`, with the image that it names, or in an image alone.
 
-    A pixel of value v in 0..255 is occupied with p = (255 - v) / 255, or v / 255 if `negate`. Its
-    cell is occupied where p > `occupied_thresh`, free where p < `free_thresh`, and unknown between
-    and where the pixel is transparent. What the file says comes before the arguments; an image
-    alone needs `resolution`, metres a pixel. `origin` is the place of its lower left corner.
+    A pixel of value v in 0..255 is occupied with p = (255 - v) / 255, or v / 255 if the file says
+    `negate`. Its cell is occupied where p > `occupied_thresh`, free where p < `free_thresh`, by
+    default .65 and .196, and unknown between and where the pixel is transparent. What the file says
+    comes before the arguments; an image alone needs `resolution`, metres a pixel. `origin` is the
+    place of its lower left corner.
 
     Raises `ImportError` without Pillow and PyYAML, which the extra `robots` brings, and
     `ValueError` for a mode other than trinary and scale, an origin that is turned, and where the
     resolution lacks. Use it with maps of `slam_toolbox` or `map_saver`, and with a drawn plan.
     """
     said: dict[str, Any] = {
-        "resolution": resolution, "origin": origin, "negate": negate,
-        "occupied_thresh": occupied_thresh, "free_thresh": free_thresh, "image": path,
+        "image": path, "mode": "trinary", "resolution": resolution, "origin": origin,
+        "negate": False, "occupied_thresh": 0.65, "free_thresh": 0.196,
     }  # fmt: skip
     if Path(path).suffix in (".yaml", ".yml"):
         said |= optional("yaml", "pyyaml").safe_load(Path(path).read_text("utf-8"))
-    if said.get("mode", "trinary") not in ("trinary", "scale"):
+    if said["mode"] not in ("trinary", "scale"):
         raise ValueError(f"mode: {said['mode']!r} of {path} is neither trinary nor scale")
     if any(said["origin"][2:]):
         raise ValueError(f"origin: {said['origin']} of {path} is turned; turn the image instead")
@@ -203,13 +177,9 @@ def read_map(
     image = optional("PIL.Image", "pillow").open(Path(path).parent / said["image"])
     # From the lowest row up: an image begins at the top.
     grey, opaque = np.moveaxis(np.asarray(image.convert("LA"), float)[::-1] / 255, -1, 0)
-    occupied = grey if said["negate"] else 1 - grey
-    return OccupancyGrid(
-        (occupied > said["occupied_thresh"]) & (opaque == 1),
-        (occupied < said["free_thresh"]) & (opaque == 1),
-        resolution=said["resolution"],
-        origin=said["origin"],
-    )
+    occupied = np.where(opaque == 1, grey if said["negate"] else 1 - grey, np.nan)
+    walls, free = occupied > said["occupied_thresh"], occupied < said["free_thresh"]
+    return OccupancyGrid(walls, free, resolution=said["resolution"], origin=said["origin"])
 
 
 class AbstractLaser(Fitting):
@@ -254,13 +224,11 @@ class AbstractLaser(Fitting):
         steps = [cos * forward - sin * left, sin * forward + cos * left, jnp.full_like(cos, turn)]
         met = (scan > self.laser_min_range) & (scan < self.laser_max_range)
         ranges = jnp.where(met, scan, self.laser_max_range)
-        logs = self.log_of_beams(ranges, poses + jnp.stack(steps, axis=1), angles, grid)
+        logs = self.log_beams(ranges, poses + jnp.stack(steps, axis=1), angles, grid)
         return self.exponent * jnp.sum(jnp.where(jnp.isnan(scan)[None], 0.0, logs), axis=1)
 
     @abc.abstractmethod
-    def log_of_beams(
-        self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid
-    ) -> Float[Array, "n b"]:
+    def log_beams(self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid) -> Beams:
         """log p of each beam from each pose of the scanner; one that met nothing has the most."""
 
 
@@ -270,9 +238,9 @@ class LikelihoodField(AbstractLaser):
         p = z_hit N(d; 0, sigma_hit²) + z_rand / laser_max_range
 
     with d from the end of the beam to the nearest occupied cell, and
-    `laser_likelihood_max_dist` where that is less. Beams that met nothing say nothing. AMCL has the
-    same numbers under the same names, but leaves the factor 1 / (sigma_hit √(2π)) out, and adds the
-    cubes of p in place of their logarithms.
+    `laser_likelihood_max_dist` where that is less, or the end is off the map. Beams that met
+    nothing say nothing. AMCL has the same numbers under the same names, but leaves the factor 1 /
+    (sigma_hit √(2π)) out, and adds the cubes of p in place of their logarithms.
 
     It is smooth, and takes a look-up a beam: use it first, and `AbstractLaser` says what its other
     parameters are. It does not know that a beam cannot pass a wall.
@@ -280,11 +248,9 @@ class LikelihoodField(AbstractLaser):
 
     laser_likelihood_max_dist: Positive = eqx.field(static=True, kw_only=True, default=2.0)
 
-    def log_of_beams(
-        self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid
-    ) -> Float[Array, "n b"]:
+    def log_beams(self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid) -> Beams:
         """By the distance of each beam's end to the nearest occupied cell."""
-        gaps = grid.distance_at(_ends(poses, angles, ranges[None]))
+        gaps = grid.at(_ends(poses, angles, ranges[None]), grid.distances, jnp.inf)
         hit = jnp.exp(log_normal(jnp.minimum(gaps, self.laser_likelihood_max_dist), self.sigma_hit))
         density = self.z_hit * hit + self.z_rand / self.laser_max_range
         logs = jnp.log(density / (self.z_hit + self.z_rand))
@@ -309,9 +275,7 @@ class BeamModel(AbstractLaser):
     z_max: Weight = eqx.field(kw_only=True, converter=to_array("z_max"), default=0.05)
     lambda_short: Scale = eqx.field(kw_only=True, converter=to_array("lambda_short"), default=0.1)
 
-    def log_of_beams(
-        self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid
-    ) -> Float[Array, "n b"]:
+    def log_beams(self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid) -> Beams:
         """By the range to the first occupied cell."""
         most, expected = self.laser_max_range, grid.ranges(poses, angles, self.laser_max_range)
         inside = ndtr((most - expected) / self.sigma_hit) - ndtr(-expected / self.sigma_hit)
@@ -336,64 +300,41 @@ class OdometryMotion(Fitting):
     no direction: its noise is that of a turn alone. Each deviation is at least 10⁻⁴ (m, rad).
     """
 
-    alpha1: Weight = eqx.field(converter=to_array("alpha1"), default=0.2)
-    alpha2: Weight = eqx.field(converter=to_array("alpha2"), default=0.2)
-    alpha3: Weight = eqx.field(converter=to_array("alpha3"), default=0.2)
-    alpha4: Weight = eqx.field(converter=to_array("alpha4"), default=0.2)
+    alpha1: Weight = eqx.field(kw_only=True, converter=to_array("alpha1"), default=0.2)
+    alpha2: Weight = eqx.field(kw_only=True, converter=to_array("alpha2"), default=0.2)
+    alpha3: Weight = eqx.field(kw_only=True, converter=to_array("alpha3"), default=0.2)
+    alpha4: Weight = eqx.field(kw_only=True, converter=to_array("alpha4"), default=0.2)
 
     noise_dimension = 3
-
-    def law(self, odometry: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """rot1, trans and rot2 of a step, and their deviations."""
-        forward, left, turn = odometry
-        way = jnp.where(forward < 0, -1, 1).astype(forward.dtype)
-        trans, first = way * jnp.hypot(forward, left), jnp.arctan2(way * left, way * forward)
-        second = _wrapped(turn - first)
-        one = jnp.where(jnp.abs(trans) < _IN_PLACE, 0.0, first) ** 2
-        other, drive = jnp.where(jnp.abs(trans) < _IN_PLACE, turn, second) ** 2, trans**2
-        variances = jnp.stack(
-            [
-                self.alpha1 * one + self.alpha2 * drive,
-                self.alpha3 * drive + self.alpha4 * (one + other),
-                self.alpha1 * other + self.alpha2 * drive,
-            ]
-        )
-        return jnp.stack([first, trans, second]), jnp.sqrt(variances + _AT_REST**2)
 
     def from_noise(
         self, noise: Float[Array, "n 3"], poses: Poses, odometry: Float[Array, "3"]
     ) -> Poses:
         """Poses after the step, made of standard normal noise."""
-        mean, deviations = self.law(odometry)
-        first, trans, second = (mean[None] + deviations[None] * noise).T
+        forward, left, turn = odometry
+        way = jnp.where(forward < 0, -1, 1).astype(forward.dtype)
+        trans, rot1 = way * jnp.hypot(forward, left), jnp.arctan2(way * left, way * forward)
+        rot2 = _wrapped(turn - rot1)
+        one = jnp.where(jnp.abs(trans) < _IN_PLACE, 0.0, rot1) ** 2
+        other, drive = jnp.where(jnp.abs(trans) < _IN_PLACE, turn, rot2) ** 2, trans**2
+        variances = [
+            self.alpha1 * one + self.alpha2 * drive,
+            self.alpha3 * drive + self.alpha4 * (one + other),
+            self.alpha1 * other + self.alpha2 * drive,
+        ]
+        deviations = jnp.sqrt(jnp.stack(variances) + _AT_REST**2)
+        first, far, second = (jnp.stack([rot1, trans, rot2])[None] + deviations[None] * noise).T
         x, y, heading = poses.T
-        heading = heading + first
-        moved = [x + trans * jnp.cos(heading), y + trans * jnp.sin(heading)]
-        return jnp.stack([*moved, _wrapped(heading + second)], axis=1)
-
-    def log_density(
-        self, poses: Poses, previous_poses: Poses, odometry: Float[Array, "3"]
-    ) -> Float[Array, " n"]:
-        """log of the density of poses after the step; there are two ways, forwards and back."""
-        mean, deviations = self.law(odometry)
-        x, y, turned = (poses - previous_poses).T
-        heading, far = previous_poses[:, 2], jnp.hypot(x, y)
-        ways = []
-        for way in (1.0, -1.0):
-            first = jnp.arctan2(way * y, way * x) - heading
-            steps = jnp.stack([first, way * far, turned - first], axis=1) - mean[None]
-            steps = jnp.where(np.array([[True, False, True]]), _wrapped(steps), steps)
-            ways.append(jnp.sum(log_normal(steps, deviations[None]), axis=1))
-        # Two ways to a place that is one float from the last would have no density.
-        return jnp.logaddexp(*ways) - jnp.log(jnp.maximum(far, 0.01 * _AT_REST))
+        x, y = x + far * jnp.cos(heading + first), y + far * jnp.sin(heading + first)
+        return jnp.stack([x, y, _wrapped(heading + first + second)], axis=1)
 
 
 class RobotModel(AbstractStateSpaceModel, Fitting):
     """A robot that is lost in a map: states are poses (x, y, heading), in metres and radians.
 
     - `grid`: the map, see `read_map`.
-    - `motion`: `OdometryMotion`, or another with `noise_dimension`, `from_noise(noise, poses,
-      odometry)` and, for smoothers, `log_density(poses, previous_poses, odometry)`.
+    - `motion`: `OdometryMotion`, or another with `noise_dimension` and `from_noise(noise, poses,
+      odometry)`.
     - `sensor`: `LikelihoodField`, `BeamModel`, or another with `log_likelihood(scan, poses, grid)`.
     - `clearance`: x_0 is farther than this from all occupied cells, metres; the robot's radius.
     - `initial_pose`, `initial_deviations`: x_0 is normal about this pose, with these deviations of
@@ -401,7 +342,8 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
 
     Inputs are odometry, one step (forward, left, turn) in the robot's frame at a time, see
     `odometry_steps`, and observations are scans (k,), of which some beams may be missing. A pose in
-    an unknown cell has a log-likelihood of -1000. Raises `ValueError` where no cell is free.
+    an unknown cell has a log-likelihood of -1000. `starts` are the corners of the cells of x_0.
+    Raises `ValueError` where no cell is free.
     """
 
     grid: OccupancyGrid
@@ -425,30 +367,22 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
         self.initial_pose = to_array("initial_pose")(initial_pose)
         self.initial_deviations = to_array("initial_deviations")(initial_deviations)
         is_start = np.asarray(grid.free & (grid.distances > clearance))
-        self.starts = _to_floats(np.argwhere(is_start)[:, ::-1])
-        self.inputs = inputs
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
+        corners = np.argwhere(is_start)[:, ::-1] * grid.resolution + grid.origin
+        self.starts = jnp.asarray(corners, float)
         if not len(self.starts):
-            raise ValueError(
-                f"clearance: no free cell is {self.clearance} m from all occupied ones"
-            )
+            raise ValueError(f"clearance: no free cell is {clearance} m from all occupied ones")
+        self.inputs = inputs
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Poses:
         """x_0."""
         if self.initial_pose is not None:
             noise = normal(key, (num_particles, 3), self.initial_pose.dtype)
-            x, y, heading = (self.initial_pose[None] + self.initial_deviations[None] * noise).T
-            return jnp.stack([x, y, _wrapped(heading)], axis=1)
+            return self.initial_pose[None] + self.initial_deviations[None] * noise
         key_cell, key_rest = split(key, 2)
         cells = self.starts[jax.random.randint(key_cell, (num_particles,), 0, len(self.starts))]
         shares = uniform(key_rest, (num_particles, 3))
-        x, y = (
-            self.grid.origin[k] + self.grid.resolution * (cells[:, k] + shares[:, k])
-            for k in (0, 1)
-        )
-        return jnp.stack([x, y, np.pi * (2 * shares[:, 2] - 1)], axis=1)
+        places = cells + self.grid.resolution * shares[:, :2]
+        return jnp.concatenate([places, np.pi * (2 * shares[:, 2:] - 1)], axis=1)
 
     def log_initial(self, states: Poses) -> Float[Array, " n"]:
         """log p(x_0), by square metre and radian."""
@@ -467,23 +401,16 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
 
     def transition_from_noise(self, noise: Float[Array, "n k"], states: Poses) -> Poses:
         """x_t, after the step that odometry says."""
-        return self.motion.from_noise(noise, states, self._odometry)
-
-    def log_transition(self, states: Poses, previous_states: Poses) -> Float[Array, " n"]:
-        """log D(x_t | x_{t-1})."""
-        return self.motion.log_density(states, previous_states, self._odometry)
-
-    @property
-    def _odometry(self) -> Any:
         if self.inputs is None:
             raise ValueError("inputs: None, but a RobotModel needs odometry, a row for each step")
-        return self.inputs
+        return self.motion.from_noise(noise, states, self.inputs)
 
     def log_likelihood(self, observation: Float[Array, " k"], states: Poses) -> Float[Array, " n"]:
         """log p of a scan at each pose."""
         logs = self.sensor.log_likelihood(observation, states, self.grid)
         known = self.grid.at(states[:, :2], self.grid.free | self.grid.occupied, False)
-        return jnp.where(known, logs, NOT_ON_THE_MAP)
+        # Finite, so that a filter goes on whose robot drives beyond the map.
+        return jnp.where(known, logs, -1000.0)
 
 
 def odometry_steps(poses: Any) -> Float[np.ndarray, "t 3"]:

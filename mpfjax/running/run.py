@@ -10,7 +10,7 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.observations import as_series
+from mpfjax.models.observations import as_series, gathered
 from mpfjax.moves.eve_indices import EVE_INDICES, with_new_eve_indices
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import num_processors, over_devices, over_threads
@@ -34,8 +34,8 @@ def run_filter(
 ) -> FilterRun:
     """Run a filter over observations y_1..y_t in one scan.
 
-    - `observations`: a pytree whose leaves have a leading axis t; or a `Series`, which says itself
-      what `inputs` and `missing` say otherwise.
+    - `observations`: a pytree whose leaves have a leading axis t; or a `Series`, for which `inputs`
+      and `missing` are short, here alone.
     - `collect`: a function of the mixture after each step, or of (mixture, t, u_t) with t from 1
       on; its results are stacked over t. None keeps the whole mixture. The same function object
       compiles once; a new lambda in every call compiles again. Methods of a mixture are for one
@@ -53,7 +53,7 @@ def run_filter(
     a model that has no place for them. Raises `ValueError` during tracing for a model whose draws
     or densities have the wrong shape or type, and RuntimeError if its densities give NaN.
     """
-    series = as_series(observations, filter.model, inputs, missing)
+    series = as_series(gathered(observations, inputs, missing), filter.model)
     run = with_floats_traced(lambda own: _run(key, own, series, collect), filter)
     return told_of_start(sound(run), filter)
 
@@ -65,15 +65,13 @@ def monte_carlo(
     observations: PyTree,
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
-    inputs: PyTree = None,
-    missing: Literal["error", "skip"] = "error",
     devices: int | Sequence[Any] | None = None,
     slots: Count | None = None,
 ) -> FilterRun:
-    """Run a filter once for each key, all on the same observations and inputs, under `vmap`.
+    """Run a filter once for each key, all on the same observations, under `vmap`.
 
-    Every field of the result has a leading axis of seeds. Arguments and errors are those of
-    `run_filter`; run k equals `run_filter(keys[k], ...)`.
+    Every field of the result has a leading axis of seeds. Run k equals `run_filter(keys[k], ...)`,
+    whose errors it raises. With inputs, or where some are missing, `observations` is a `Series`.
 
     - `devices`: the devices that share the runs. None is every device, of all processes after
       `jax.distributed.initialize`. A number means the first few, a sequence those of
@@ -92,7 +90,7 @@ def monte_carlo(
     """
     if slots is not None and slots < filter.num_particles:
         raise ValueError(f"slots: {slots} is no whole number of at least N, {filter.num_particles}")
-    series = as_series(observations, filter.model, inputs, missing)
+    series = as_series(observations, filter.model)
 
     def run(filter: Filter) -> FilterRun:
         starts = (keys, None)

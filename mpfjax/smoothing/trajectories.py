@@ -34,7 +34,7 @@ def sample_trajectories(
     *,
     component: CountOrZero | None = None,
     method: Literal["exact", "mcmc"] = "exact",
-    num_moves: Count | None = None,
+    num_moves: Count = 1,
     inputs: PyTree = None,
     observations: PyTree = None,
 ) -> PyTree:
@@ -53,8 +53,8 @@ def sample_trajectories(
       Chopin 2023) starts at the ancestor of x_{s+1} and makes `num_moves` steps of independent
       Metropolis-Hastings, with proposals by W_s: O(1) for a trajectory and step. It is as exact as
       N grows.
-    - `num_moves`: of "mcmc"; None is one.
-    - `inputs`: u_1, ..., u_t, the known inputs that the run had.
+    - `num_moves`: of "mcmc".
+    - `inputs`: u_1, ..., u_t, the known inputs that the run had, where no `Series` says them.
     - `observations`: y_1..y_t, arrays or a `Series`, which a conditionally linear model needs and
       no other takes; a NaN is a missing number.
       Backward sampling is then that of Lindsten, Bunch, Särkkä, Schön and Godsill (2016): latents
@@ -72,6 +72,8 @@ def sample_trajectories(
     if not is_mixed(model):
         require(model, "log_transition", "sample_trajectories")
     stacked = mixtures_of(mixtures)
+    series = gathered(observations, inputs)
+    inputs, observations = series.inputs, series.observations
     # Those of the steps from each of the mixtures to the next.
     length = stacked.log_weights.shape[0]
     if isinstance(mixtures, FilterRun):
@@ -82,7 +84,7 @@ def sample_trajectories(
     if component is not None:
         _check_component(stacked, component)
     if is_marginalised(model) or observations is not None:
-        observations = as_arrays(gathered(observations).observations)
+        observations = as_arrays(observations)
         check_marginalised(model, stacked, observations, method)
         drawn, indices = sample_marginalised(
             key, model, stacked, observations, inputs, num_trajectories, component
@@ -90,7 +92,7 @@ def sample_trajectories(
     else:
         if method == "mcmc":
             stacked = with_parents(stacked, "sample_trajectories with method 'mcmc', not 'exact',")
-        options = (num_trajectories, component, 0 if method == "exact" else num_moves or 1)
+        options = (num_trajectories, component, 0 if method == "exact" else num_moves)
         drawn, indices = draw_trajectories(key, model, stacked, inputs, *options)
     _warn_of_few(indices, stacked)
     return drawn

@@ -101,7 +101,7 @@ def mean(mixture):
 def log_errors(name, filter):
     """log Ẑ / Z and the means at every step, of a run for each key."""
     case = CASES[name]
-    run = mpfjax.monte_carlo(KEYS, filter, case.observations, mean, missing="skip")
+    run = mpfjax.monte_carlo(KEYS, filter, mpfjax.Series.skipping(case.observations), mean)
     exact = case.exact(case.observations)
     gaps = np.asarray(run.log_likelihood_increments - exact.log_likelihood_increments[None])
     return np.cumsum(gaps, axis=1), np.asarray(run.collected)

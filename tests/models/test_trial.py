@@ -325,7 +325,7 @@ def test_a_run_without_any_likelihood_says_so_once(recwarn):
     with pytest.warns(RuntimeWarning, match="every step with an observation was degenerate:"):
         mpfjax.run_filter(keys[0], filter, far, missing="skip")
     with pytest.warns(RuntimeWarning, match="degenerate in 3 of 3 runs") as found:
-        mpfjax.monte_carlo(keys, filter, far, missing="skip")
+        mpfjax.monte_carlo(keys, filter, mpfjax.Series.skipping(far))
     assert [each.filename for each in found] == [__file__]  # the line that ran it
 
 
@@ -343,4 +343,4 @@ def test_a_run_in_which_one_particle_has_all_weight_says_so_once(recwarn):
     with pytest.warns(RuntimeWarning, match=f"{said}: .*units"):
         mpfjax.run_filter(keys[0], filter, 1000 * seen, missing="skip")
     with pytest.warns(RuntimeWarning, match=f"{said} in 3 of 3 runs"):
-        mpfjax.monte_carlo(keys, filter, 1000 * seen, missing="skip")
+        mpfjax.monte_carlo(keys, filter, mpfjax.Series.skipping(1000 * seen))

@@ -20,7 +20,7 @@ def indicators(mixture):
 
 def runs(*moves, observations=OBSERVATIONS):
     filter = mpfjax.Filter(MODEL, [Propagate(), *moves], 40, 3, [KMeans(2, reseed=True)])
-    return mpfjax.monte_carlo(KEYS, filter, observations, indicators, missing="skip")
+    return mpfjax.monte_carlo(KEYS, filter, mpfjax.Series.skipping(observations), indicators)
 
 
 def run(*moves, observations=OBSERVATIONS):

@@ -89,7 +89,7 @@ def test_errors_are_at_most_those_of_independent_noise_where_nothing_is_sorted(n
     make, observations, collect, exact, bound = DEALT_ANEW[name]
     collected = collect or (lambda mixture: None)
     keys, seen = jax.random.split(jax.random.key(5), 16), np.array(observations, np.float32)
-    run = mpfjax.monte_carlo(keys, make(), seen, collected, missing="skip")
+    run = mpfjax.monte_carlo(keys, make(), mpfjax.Series.skipping(seen), collected)
     found = run.log_marginal_likelihood if collect is None else run.collected[:, -1]
     errors = np.asarray(found, float) - exact
     assert np.sqrt(np.mean(errors**2)) < bound / np.sqrt(SIZE)

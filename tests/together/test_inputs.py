@@ -155,7 +155,7 @@ def test_the_references_take_controls_and_matrices_by_time():
 def test_evidence_and_means_are_unbiased():
     """E[Ẑ/Z] = 1 and E[Ẑ/Z E^[x_t]] = E[x_t | y_1..y_t], within 4 standard errors."""
     filter, keys = mpfjax.particle_filter(Driven(), 48), jax.random.split(KEY, 2000)
-    run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean, inputs=INPUTS)
+    run = mpfjax.monte_carlo(keys, filter, mpfjax.Series(OBSERVATIONS, INPUTS), mean)
     log_z, filtered, _ = truth()
     ratios = ratios_to(log_z, run)
     assert_unbiased(ratios, loosest=0.04)
@@ -314,7 +314,7 @@ def test_a_missing_observation_does_not_miss_its_input():
 @pytest.mark.exactness
 def test_monte_carlo_islands_and_studies_hand_them_on(tmp_path):
     expected, series = run().log_marginal_likelihood, mpfjax.Series(OBSERVATIONS, INPUTS)
-    runs = mpfjax.monte_carlo(KEY[None], FILTER, OBSERVATIONS, nothing, inputs=INPUTS)
+    runs = mpfjax.monte_carlo(KEY[None], FILTER, series, nothing)
     np.testing.assert_allclose(runs.log_marginal_likelihood[0], expected, rtol=1e-5)
 
     def make(num_particles):

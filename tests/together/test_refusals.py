@@ -547,8 +547,8 @@ MISTAKEN = (
      lambda: mpfjax.LinearGaussianModel(EYE, EYE, EYE, EYE)),
     ("run_filter: 6 arguments without a name; it takes key, .*, and by name inputs, missing",
      lambda: mpfjax.run_filter(KEY, FILTER, TWO, None, None, "skip")),
-    ("smoothed_sums: missing is none of", lambda: smoothing.smoothed_sums(
-        **FILTERED, function=difference, missing="skip")),
+    (r"smoothed_sums: missing is none of .*; write observations=Series.skipping\(y\)",
+     lambda: smoothing.smoothed_sums(**FILTERED, function=difference, missing="skip")),
     ("run_filter: key is missing", lambda: mpfjax.run_filter(FILTER, TWO)),
     ("Filter.init: key is missing", lambda: FILTER.init()),
     (r"monte_carlo: keys is missing, .* jax.random.split\(",

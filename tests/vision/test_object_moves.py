@@ -42,7 +42,9 @@ def test_exclusion_by_hand():
 
 def test_hypotheses_of_one_object_do_not_exclude_each_other():
     mixture = mixture_of([(0, 0, 0.0, 0.5), (1, 0, 0.5, 0.5)])
-    moved = eqx.filter_jit(ObjectExclusion())(jax.random.key(0), mixture, NOW)
+    moved = eqx.filter_jit(ObjectExclusion(strength=3.0, radius=0.5, scale=1.0))(
+        jax.random.key(0), mixture, NOW
+    )
     np.testing.assert_array_equal(np.asarray(moved.log_weights), np.asarray(mixture.log_weights))
 
 

@@ -50,8 +50,8 @@ class Exclusion(AbstractExclusion, ByFeatures):
     Raises `ValueError` for a strength or radius that is not positive.
     """
 
-    strength: Positive = eqx.field(static=True, default=10.0, kw_only=True)
-    radius: Positive = eqx.field(static=True, default=0.5, kw_only=True)
+    strength: Positive = eqx.field(static=True, kw_only=True)
+    radius: Positive = eqx.field(static=True, kw_only=True)
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Lower the weight of every particle by its nearness to the means of other components."""

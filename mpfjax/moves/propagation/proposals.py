@@ -141,7 +141,9 @@ class GaussNewtonProposal(_GaussianProposal):
     Each iteration linearises h at the current point, with its Jacobian H by JAX, and solves for the
     mean of the resulting Gaussian, whose precision is Λ = Q⁻¹ + Hᵀ R⁻¹ H (Doucet, Godsill and
     Andrieu 2000, section II.D, local linearisation). The draw is from N(mean, inflation² Λ⁻¹). An
-    inflation above one keeps the weights bounded if the Gaussian is narrower than the target.
+    inflation above one keeps the weights bounded if the Gaussian is narrower than the target. It
+    costs no exactness, as weights correct for it; the default of `GaussianRegeneration`, where
+    nothing does, is 1.
 
     The model has `transition_mean`, `observation_mean`, `transition_covariance`, (d, d), and
     `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.

@@ -34,7 +34,8 @@ class GaussianRegeneration(AbstractResampling):
     - `where`: selects the part of the state that is redrawn, such as `lambda state: state.box`. The
       rest (angles, bounded or whole numbers) is copied from resampled particles. None redraws the
       whole state.
-    - `inflation`: of the standard deviations; above 1 it compensates for the loss of spread.
+    - `inflation`: of the standard deviations; above 1 it compensates for the loss of spread. No
+      weight corrects for it, as it does in a `GaussNewtonProposal`, so the default is 1.
     - `noise`: "independent"; or "stratified" or "rqmc", which spread the draws of all slots, or of
       each component, evenly. With "rqmc", each component's draws are then ordered along a Hilbert
       curve, as `Propagate(noise="rqmc")` needs them.

@@ -180,9 +180,9 @@ class ColourModel(AbstractBoxModel):
     initial_deviations: Float[Array, "k 4"]
     sigma: Float[Array, ""]
     colours: AbstractColours
-    switch_probability: Share = eqx.field(static=True, default=0.0)
-    contrast: NotNegative = eqx.field(static=True, default=0.0)
-    wide_counts: bool = eqx.field(static=True, default=False)
+    switch_probability: Share = eqx.field(static=True, default=0.0, kw_only=True)
+    contrast: NotNegative = eqx.field(static=True, default=0.0, kw_only=True)
+    wide_counts: bool = eqx.field(static=True, default=False, kw_only=True)
 
     @classmethod
     @checked

@@ -84,8 +84,8 @@ def _advance(keys, filter, t, mixtures, frame):
 def track_rows(
     snapshots: list[Snapshot],
     run: CountOrZero = 0,
-    first: CountOrZero = 1,
     *,
+    first: CountOrZero = 1,
     by_reference: bool = False,
 ) -> Float[np.ndarray, "rows 6"]:
     """Rows (frame, id, x, y, w, h) of one run: an id for each life of each component.

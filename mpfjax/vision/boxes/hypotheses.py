@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.checks import check
+from mpfjax.checks import Positive, check, to_numbers
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation, Step, is_missing
 from mpfjax.moves.objects.exclusion import AbstractExclusion
@@ -120,9 +120,9 @@ class ObjectExclusion(AbstractExclusion):
     true). Use it after `Propagate`, where look-alikes cross.
     """
 
-    strength: float = eqx.field(static=True, default=3.0, kw_only=True)
-    radius: float = eqx.field(static=True, default=0.5, kw_only=True)
-    scale: tuple[float, float] = eqx.field(static=True, default=(1.0, 1.0), kw_only=True)
+    strength: Positive = eqx.field(static=True, kw_only=True)
+    radius: Positive = eqx.field(static=True, kw_only=True)
+    scale: tuple[float, ...] = eqx.field(static=True, converter=to_numbers("scale"), kw_only=True)
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Lower the weight of every particle according to its distance from the other objects."""

@@ -118,7 +118,7 @@ def objects_filters(
     learn = AdaptAppearance(rate=0.03)
     num_components = most_components(len(boxes))
     num_particles = PARTICLES_PER_HYPOTHESIS * num_components
-    exclusion = ObjectExclusion(strength=3.0, radius=0.35, scale=(float(size[0]), float(size[1])))
+    exclusion = ObjectExclusion(strength=3.0, radius=0.35, scale=size)
     mixture = Filter(
         model,
         moves=[
