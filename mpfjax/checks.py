@@ -101,7 +101,11 @@ def _check_differences(name: str, array: Any) -> None:
     if isinstance(array, Tracer) or not is_wide or default == np.float64:
         return
     is_rounded = array.dtype == np.float32
-    if np.ndim(array) == 0 or len(array) < 2 or (is_rounded and np.nanmax(np.abs(array), initial=0) < _EXACT):
+    if (
+        np.ndim(array) == 0
+        or len(array) < 2
+        or (is_rounded and np.nanmax(np.abs(array), initial=0) < _EXACT)
+    ):
         return
     rows = np.asarray(array, float).reshape(len(array), -1)
     with np.errstate(over="ignore"):
