@@ -160,7 +160,7 @@ def density(z, mean, variance):
 @pytest.mark.parametrize("apart", [12.0, 1.0])
 def test_one_scan_is_that_of_all_associations(apart):
     """Existence of old and new objects, their number, and the evidence."""
-    n, existence, scan = 400, np.array([0.9, 0.5, 0.2]), np.array([0.3, apart, 2 * apart + 0.5])
+    n, existence, scan = 400, np.array([0.9, 0.6, 0.45]), np.array([0.3, apart, 2 * apart + 0.5])
     rng, targets = np.random.default_rng(0), model()
     states = rng.normal(0, 0.5, (3, n, 1)) + apart * np.arange(3)[:, None, None]
     filter = Filter(
@@ -315,6 +315,20 @@ def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
     assert info.log_likelihood_increment == 0
     with pytest.raises(ValueError, match="observation: it is not a tuple"):
         filter.step(KEY, mixture, scans[0])
+
+
+def test_two_components_of_one_object_become_one():
+    """Where both may be true by their probabilities they stay, and where they are apart."""
+    filter = Filter(model(1e-12), [Associate(undetected_particles=10)], 210, 3)
+    near = np.linspace(-1, 1, 100) + np.array([0.0, 0.8])[:, None]
+    for gap, existence, expected in (
+        (0.0, [0.5, 0.4], [0.9, 0]), (0.0, [0.7, 0.6], [0.7, 0.6]), (9.0, [0.5, 0.4], [0.5, 0.4])
+    ):  # fmt: skip
+        states = near + gap * np.arange(2)[:, None]
+        moved = filter.predict(KEY, bernoulli_mixture(filter, states[..., None], existence))[0]
+        found = mpfjax.targets(moved)
+        np.testing.assert_allclose(found.existence, 0.95 * np.array(expected), atol=1e-3)
+        assert found.labels.tolist() == [1, 2 if expected[1] else 0]
 
 
 def test_derivatives_of_the_evidence():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
 from mpfjax.checks import Count, Share, check
-from mpfjax.mixture import ParticleMixture, no_ancestors
+from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.clutter import filled, measured
 from mpfjax.models.targets import TargetsModel
@@ -21,6 +21,7 @@ from mpfjax.operations.random import split, uniform
 from mpfjax.operations.stored import take
 
 TARGETS = "targets"
+_SAME = 2.0  # pooled deviations within which two components may describe one object
 
 
 class _Intensity(NamedTuple):
@@ -59,7 +60,9 @@ class Associate(AbstractWrapper):
     that its object exists, those of component 0 to the expected number of objects that no
     measurement has revealed yet. After a `Predict`, with G_j = p_D N(y_j | x) / λ(y_j),
 
-    1. u is multiplied by p_S, and new objects join component 0.
+    1. Two components become one where they describe one object, begun at different measurements:
+       their means are within two pooled deviations in each number of the state, and their r add up
+       to one at most. u is multiplied by p_S, and new objects join component 0.
     2. Each measurement may be the first of an object, whose particles are drawn ∝ G_j u from
        component 0, and from those that the birth proposes at the measurement.
     3. Each u becomes u (1 - p_D) P(m has none) / P₀ + Σ_j u G_j P(m has j) / Σ_m u G_j, with the
@@ -70,10 +73,11 @@ class Associate(AbstractWrapper):
     5. Each component is resampled, by `resample`, and component 0 systematically.
 
     The mass grows by log p of the scan over that of clutter alone, as that of `ClutteredModel`.
-    Three things are approximate: belief propagation, whose log p is Bethe's, and exact where no two
-    objects compete for two measurements; step 4; and the product form after each scan. Labels count
-    objects up from 1. They are not identities once two objects have been close, whoever computes
-    them. `memory["targets"]` holds the number, the labels, and how many objects were crowded out.
+    Approximate are belief propagation, whose log p is Bethe's, and exact where no two objects
+    compete for two measurements; components that become one; step 4; and the product form after
+    each scan. Labels count objects up from 1. They are not identities once two objects have been
+    close, whoever computes them. `memory["targets"]` holds the number, the labels, and how many
+    objects were crowded out.
 
     - `particles_per_birth`: the particles of a new object at each measurement.
     - `undetected_particles`: those of component 0, which fill the first slots.
@@ -135,8 +139,9 @@ class Associate(AbstractWrapper):
     ) -> _Intensity:
         """The intensity before the scan: of survivors and new objects."""
         size, number = self.undetected_particles, mixture.memory[TARGETS]["number"]
+        components = _once_each(mixture, number)
         masses = number * mixture.weights * model.survival(mixture.particles)
-        undetected = jnp.where(mixture.component_indicators == 0, masses, 0.0)
+        undetected = jnp.where(components == 0, masses, 0.0)
         # In the first step these fill all slots, of which the first ones stand for all.
         tiny = jnp.finfo(masses.dtype).tiny
         share = jnp.sum(undetected) / jnp.maximum(jnp.sum(undetected[:size]), tiny)
@@ -148,7 +153,7 @@ class Associate(AbstractWrapper):
         return _Intensity(
             jax.tree.map(joined, mixture.particles, model.birth.sample(key, size)),
             jnp.concatenate([share * undetected[:size], rate, (masses - undetected)[size:]]),
-            jnp.maximum(mixture.component_indicators[size:] - 1, 0),
+            jnp.maximum(components[size:] - 1, 0),
             2 * size,
             mixture.num_components - 1,
             jnp.zeros_like(mixture.log_scale),
@@ -279,6 +284,23 @@ class Associate(AbstractWrapper):
             log_scale=mixture.log_scale + intensity.log_evidence,
             memory=mixture.memory | {TARGETS: memory},
         )
+
+
+def _once_each(mixture: ParticleMixture, number: Float[Array, ""]) -> Int[Array, " n"]:
+    """The component of each particle, after one that describes a more probable object joins it."""
+    existence = number * mixture.mixture_weights
+    means = flatten_states(mixture.component_means())
+    variances = jnp.diagonal(mixture.component_covariances(), axis1=1, axis2=2)
+    pooled = (variances[:, None] + variances[None]) / 2
+    pairs = jnp.all((means[:, None] - means[None]) ** 2 < _SAME**2 * pooled, axis=2)
+    pairs &= existence[:, None] + existence[None] <= 1
+    pairs = jnp.triu(pairs, 1).at[0].set(False)
+    pairs &= jnp.cumsum(pairs, axis=0) == 1  # each joins the most probable one
+    pairs &= ~jnp.any(pairs, axis=0)[:, None]  # which does not join another
+    pairs &= jnp.cumsum(pairs, axis=1) == 1  # and takes one
+    places = jnp.arange(len(pairs), dtype=jnp.int32)
+    chosen = jnp.argmax(pairs, axis=0).astype(jnp.int32)
+    return take(jnp.where(jnp.any(pairs, axis=0), chosen, places), mixture.component_indicators)
 
 
 def _redrawn(
