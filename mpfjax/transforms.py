@@ -154,7 +154,7 @@ def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
 def with_start(filter: Filter, num_observations: Count = 8) -> Filter:
     """The filter that begins by a tempered sampler on its first L observations.
 
-    In these steps it costs as much as some 2000 of a plain filter where the prior is wide, little
+    In these steps it costs as much as some 800 of a plain filter where the prior is wide, little
     where it is not; Ẑ stays unbiased, and derivatives in these steps are the score. It takes the
     place of a choice of x_0 by y_1 alone. Online, give y_1 to `filter.init` as well as to the first
     step. Raises `ValueError` for a model without `log_initial`, a density in all numbers of the

@@ -84,7 +84,7 @@ class AbstractStateSpaceModel(eqx.Module):
 
 def takes_inputs(model: Any) -> bool:
     """Whether a model takes u_t: it has a field `inputs`, or its own `with_inputs`."""
-    model = _innermost(model)
+    model = innermost(model)
     method = getattr(type(model), "with_inputs", AbstractStateSpaceModel.with_inputs)
     return hasattr(model, "inputs") or method is not AbstractStateSpaceModel.with_inputs
 
@@ -164,10 +164,10 @@ def _own(model: Any) -> Any:
     return model.model if isinstance(model, _PerParticleModel) else model
 
 
-def _innermost(model: Any) -> Any:
+def innermost(model: Any) -> Any:
     """The user's own model, of one particle or of one object where it is wrapped."""
     inner = getattr(model, "object_model", _own(model))
-    return model if inner is model else _innermost(inner)
+    return model if inner is model else innermost(inner)
 
 
 class _ModelRule(Rule):

@@ -4,11 +4,13 @@ A particle is a whole path: x_0, or the noise that it is made of, and the noise 
 a model draws x_t by a key, a key of its own for each step, so that x_t is a function of x_0 and of
 the keys. y_t enters by powers (Del Moral, Doucet and Jasra 2006). After each, paths are resampled
 and moved by Metropolis steps (resample-move, Gilks and Berzuini 2001; Chopin 2002) for the target
-p(x_0) Π_{s<t} L(y_s | x_s) L(y_t | x_t)^power. Another x_0 is proposed with the noise kept, so that
-the whole path follows, or noise of one step with x_0 kept. A pilot of paths with draws of its own,
-moved along with them, decides the powers and lends the steps of x_0, so that Ẑ is unbiased.
+p(x_0) Π_{s<t} L(y_s | x_s) L(y_t | x_t)^power. Other noise of step t is proposed, which costs a
+step, or another x_0 with the noise kept, which costs t, since the whole path follows. A pilot of
+paths with draws of its own, moved along with them, decides the powers and lends the steps of x_0,
+so that Ẑ is unbiased.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,13 +21,12 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 
 from mpfjax.checks import shown
 from mpfjax.mixture import flatten_states, single_component
-from mpfjax.models.base import is_made_of_noise, takes_inputs, with_inputs
+from mpfjax.models.base import innermost, is_made_of_noise, takes_inputs, with_inputs
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed, with_moments
 from mpfjax.models.noise import noise_dtype, normal_of, uniform_of
 from mpfjax.models.steps import completed, drawn, made_of, noise_dimension, seen
 from mpfjax.moves.resampling.ancestors import draw_ancestors
-from mpfjax.moves.resampling.line import HILBERT, in_line
-from mpfjax.moves.resampling.sorting import MOST_DIMENSIONS
+from mpfjax.moves.resampling.line import in_line
 from mpfjax.operations.logarithms import (
     add_gradient,
     default_float,
@@ -43,12 +44,11 @@ PILOT = 1 / 5
 # The part of the pilot that stays effective from one power to the next, and the most powers of one
 # observation, of which the last is 1 in any case.
 LEAST_PART, MOST_POWERS = 0.8, 64
-# After each power of y_t x_0 is moved until so many moves over t have been accepted of each path of
-# the pilot, or there were the most: a move costs t steps.
-MOVED, MOST_MOVES = 2.0, 16
-# Shares of the moves: of noise, of walks, and of differences of any two of the pilot, the others
-# being differences of neighbours.
-OF_NOISE, OF_WALKS, OF_JUMPS = 0.15, 0.25, 0.45
+# Moves of the noise after each power of y_t, and the steps that those of x_0 may take there: one
+# takes t.
+NOISE_MOVES, PATH_STEPS = 6, 12
+# Of the moves of x_0 those that are walks; the others are differences of two of the pilot.
+OF_WALKS = 0.4
 # What a move leaves of the noise of a step, and the least part of a deviation of x_0 in a walk.
 KEPT_NOISE, LEAST_SIZE = 0.7, 2.0**-8
 
@@ -66,13 +66,14 @@ class Window(NamedTuple):
 
 
 class Paths(NamedTuple):
-    """x_0 and the noise of each step, and what follows: x_t, log L(y_1..y_{t-1}), log L(y_t)."""
+    """x_0 and the noise of each step, and what follows of them."""
 
     places: PyTree  # x_0, or the noise that it is made of
     noise: Array  # (n, steps, k), normal; or the words of a key, (n, steps, 2)
-    states: PyTree
-    log_before: Float[Array, " n"]
-    log_last: Float[Array, " n"]
+    before: PyTree  # x_{t-1}
+    states: PyTree  # x_t
+    log_before: Float[Array, " n"]  # log L(y_1..y_{t-1})
+    log_last: Float[Array, " n"]  # log L(y_t)
 
 
 def check_start(model: Any, needed_by: str) -> None:
@@ -81,18 +82,13 @@ def check_start(model: Any, needed_by: str) -> None:
     if not is_made_of_noise(model, "initial") and not has_density:
         how = "nor makes x_0 of noise, initial_from_noise"
         raise ValueError(f"model: {shown(model)} defines no log_initial, {how}; {needed_by}")
-    if takes_inputs(model) and inputs_of(model) is _HIDDEN:
+    if takes_inputs(model) and not hasattr(innermost(model), "inputs"):
         raise ValueError(f"model: {shown(model)} has inputs but no field `inputs`; {needed_by}")
-
-
-_HIDDEN = object()
 
 
 def inputs_of(model: Any) -> PyTree:
     """u_t of a model that has been given them."""
-    while not hasattr(model, "inputs") and hasattr(model, "model"):
-        model = model.model
-    return getattr(model, "inputs", _HIDDEN if takes_inputs(model) else None)
+    return getattr(innermost(model), "inputs", None)
 
 
 def first_paths(key: Key[Array, ""], model: Any, num_particles: int, num_steps: int) -> Paths:
@@ -103,10 +99,10 @@ def first_paths(key: Key[Array, ""], model: Any, num_particles: int, num_steps: 
         places = normal(key_places, (n, model.initial_noise_dimension), default_float())
     else:
         places = model.sample_initial(key_places, n)
-    states, zeros = _initial(model, places), jnp.zeros(n, default_float())
+    states = _initial(model, places)
     k = _noise_size(model, states)
     noise = _noise_of(model, states, bits(key_noise, (num_steps * k, n)))
-    return Paths(places, noise.reshape(n, num_steps, k), states, zeros, zeros)
+    return _unseen(places, noise.reshape(n, num_steps, k), states)
 
 
 def observe(
@@ -114,12 +110,11 @@ def observe(
 ) -> tuple[Paths, Float[Array, ""]]:
     """The paths given y_t too, t from 1 on, and log p(y_t | y_1..y_{t-1}), of the first n."""
     model, window, paths = without_gradient((model, window, paths))
-    paths, number = _advanced(model, window, paths, t - 1), paths.noise.shape[0]
+    paths, number = _advanced(model, window, t - 1, paths), paths.noise.shape[0]
     is_pilot = jnp.arange(number) >= n
     targets = jnp.array([n, number - n], jnp.int32)
-    enough = jnp.ceil(MOVED * (number - n) / t.astype(default_float())).astype(jnp.int32)
-    num_words = 5 + 2 * flatten_states(paths.places).shape[1] + _noise_size(model, paths.states)
-    d = flatten_states(paths.places).shape[1]
+    num_moves = NOISE_MOVES + jnp.maximum(PATH_STEPS // t, 1)
+    num_words = 4 + 2 * flatten_states(paths.places).shape[1] + paths.noise.shape[2]
 
     def resampled(key: Key[Array, ""], paths: Paths, log_weights: Float[Array, " n"]) -> Paths:
         most = jnp.where(is_pilot, jnp.max(log_weights[n:]), jnp.max(log_weights[:n]))
@@ -128,7 +123,7 @@ def observe(
         mixture = single_component(paths.places, 2).replace(
             log_weights=log_weights, component_indicators=is_pilot.astype(jnp.int32)
         )
-        line = in_line(mixture, sort_by=HILBERT if 1 <= d <= MOST_DIMENSIONS else None)
+        line = in_line(mixture)
         parents = draw_ancestors(key, line, targets, "systematic", num_slots=number).particles
         return jax.tree.map(lambda leaf: take(leaf, parents), paths)
 
@@ -142,24 +137,19 @@ def observe(
         paths = resampled(key_drawn, paths, log_weights)
         pilot = flatten_states(paths.places)[n:]
 
-        def move(carry: tuple) -> tuple:
-            i, num_moved, paths = carry
+        def move(i: Int[Array, ""], paths: Paths) -> Paths:
             words = bits(jax.random.fold_in(key_moves, i), (num_words, number))
-            s = (words[0, 0] % t.astype(jnp.uint32)).astype(jnp.int32)
-            places, noise, moves_noise = _proposed(words[1:], model, paths, s, pilot)
-            new = _followed(model, window, places, noise, t)
+            is_of_noise = i < NOISE_MOVES
+            new = _proposed(words[1:], model, paths, t, pilot, is_of_noise)
+            first = jnp.where(is_of_noise, t - 1, 0)
+            new = jax.lax.fori_loop(first, t, partial(_advanced, model, window), new)
             log_ratio = _log_target(model, new, after) - _log_target(model, paths, after)
-            accepted = jnp.log(uniform_of(words[1], log_ratio.dtype)) < log_ratio
-            num_moved += jnp.sum((accepted & ~moves_noise)[n:], dtype=jnp.int32)
-            return i + 1, num_moved, select_rows(accepted, new, paths)
+            accepted = jnp.log(uniform_of(words[0], log_ratio.dtype)) < log_ratio
+            return select_rows(accepted, new, paths)
 
-        def is_more(carry: tuple) -> Bool[Array, ""]:
-            i, num_moved, _ = carry
-            # Where y_t is no surprise at all, the draws are as good as new ones.
-            return (num_moved < enough) & (i < MOST_MOVES) & ((power > 0) | (after < 1))
-
-        zero = jnp.zeros((), jnp.int32)
-        _, _, paths = jax.lax.while_loop(is_more, move, (zero, zero, paths))
+        # Where y_t is no surprise at all, the draws are as good as new ones.
+        is_moved = (power > 0) | (after < 1)
+        paths = jax.lax.fori_loop(0, jnp.where(is_moved, num_moves, 0), move, paths)
         return key, paths, after, log_mean, count + 1
 
     zero = jnp.zeros((), default_float())
@@ -177,11 +167,10 @@ def with_derivatives(
     """
 
     def advance(now: Paths, s: Int[Array, ""]) -> tuple[Paths, None]:
-        new = _advanced(model, window, now, s)
+        new = _advanced(model, window, s, now)
         return jax.tree.map(lambda new, old: jnp.where(s < t, new, old), new, now), None
 
-    zeros = jnp.zeros_like(paths.log_last)
-    first = Paths(paths.places, paths.noise, _initial(model, paths.places), zeros, zeros)
+    first = _unseen(paths.places, paths.noise, _initial(model, paths.places))
     last, _ = jax.lax.scan(advance, first, jnp.arange(window.present.shape[0]))
 
     def tied(value: Array, source: Array) -> Array:
@@ -196,6 +185,12 @@ def _log_target(model: Any, paths: Paths, power: Any) -> Float[Array, " n"]:
     else:
         log_prior = model.log_initial(paths.places)
     return log_prior + paths.log_before + power * paths.log_last
+
+
+def _unseen(places: PyTree, noise: Array, states: PyTree) -> Paths:
+    """Paths before any observation."""
+    zeros = jnp.zeros(noise.shape[0], default_float())
+    return Paths(places, noise, states, states, zeros, zeros)
 
 
 def _initial(model: Any, places: PyTree) -> PyTree:
@@ -216,7 +211,7 @@ def _noise_of(model: Any, states: PyTree, words: UInt32[Array, "k n"]) -> Array:
     return (normal_of(words, noise_dtype(states)) if _is_of_noise(model) else words).T
 
 
-def _advanced(model: Any, window: Window, paths: Paths, s: Int[Array, ""]) -> Paths:
+def _advanced(model: Any, window: Window, s: Int[Array, ""], paths: Paths) -> Paths:
     """The paths one step further, to that of index s."""
     now, noise = window.at(s), jax.lax.dynamic_index_in_dim(paths.noise, s, 1, False)
     model = with_inputs(model, now.inputs)
@@ -233,14 +228,7 @@ def _advanced(model: Any, window: Window, paths: Paths, s: Int[Array, ""]) -> Pa
     states, logs = seen(model, now.observations, completed(model, draws, paths.states))
     log_last = jnp.where(now.present, sum(logs), 0.0).astype(paths.log_last.dtype)
     log_before = paths.log_before + paths.log_last
-    return paths._replace(states=states, log_before=log_before, log_last=log_last)
-
-
-def _followed(model: Any, window: Window, places: PyTree, noise: Array, t: Int[Array, ""]) -> Paths:
-    """The paths from these x_0 and of this noise, to step t."""
-    zeros = jnp.zeros(noise.shape[0], default_float())
-    first = Paths(places, noise, _initial(model, places), zeros, zeros)
-    return jax.lax.fori_loop(0, t, lambda s, now: _advanced(model, window, now, s), first)
+    return Paths(paths.places, paths.noise, paths.states, states, log_before, log_last)
 
 
 def _growth(log_last: Float[Array, " p"], rest: Float[Array, ""]) -> Float[Array, ""]:
@@ -262,31 +250,32 @@ def _growth(log_last: Float[Array, " p"], rest: Float[Array, ""]) -> Float[Array
 
 
 def _proposed(
-    words: UInt32[Array, "w n"], model: Any, paths: Paths, s: Int[Array, ""], pilot: Array
-) -> tuple[PyTree, Array, Bool[Array, " n"]]:
-    """Other x_0 with the same noise, or the same with other noise of step s, and which it is.
+    words: UInt32[Array, "w n"],
+    model: Any,
+    paths: Paths,
+    t: Int[Array, ""],
+    pilot: Array,
+    is_of_noise: Bool[Array, ""],
+) -> Paths:
+    """The paths with other noise of step t at x_{t-1}, or with the same at another x_0.
 
-    Steps of x_0 are walks of many sizes, in each coordinate another, and differences of two of the
-    pilot, which are in order along a curve: those of neighbours fit a mode, and those of any two
-    lead from mode to mode.
+    Steps of x_0 are walks of many sizes, in each coordinate another, and differences of any two of
+    the pilot, which lead from mode to mode.
     """
     (p, d), flat = pilot.shape, flatten_states(paths.places)
     to_places = jax.vmap(ravel_pytree(jax.tree.map(lambda leaf: leaf[0], paths.places))[1])
-    kind, first, apart = uniform_of(words[1:4], pilot.dtype)
-    sizes, directions = words[4 : 4 + d], words[4 + d : 4 + 2 * d]
+    kind, *pair = uniform_of(words[:3], pilot.dtype)
+    sizes, directions = words[3 : 3 + d], words[3 + d : 3 + 2 * d]
     deviations = jnp.std(pilot, axis=0, keepdims=True)
     walk = deviations * LEAST_SIZE ** uniform_of(sizes, pilot.dtype).T
     walk *= normal_of(directions, pilot.dtype).T
-    one = (first * p).astype(jnp.int32)
-    is_jump = kind > 1 - OF_JUMPS
-    distance = jnp.where(is_jump, p * apart, jnp.exp(jnp.log(p / 2) * apart)).astype(jnp.int32)
-    other = (one + jnp.where(words[3] % 2 == 0, distance, p - distance)) % p
-    step = select_rows(kind < OF_NOISE + OF_WALKS, walk, take(pilot, one) - take(pilot, other))
-    moves_noise = kind < OF_NOISE
-    places = to_places(flat + select_rows(moves_noise, jnp.zeros_like(step), step))
-    now = jax.lax.dynamic_index_in_dim(paths.noise, s, 1, False)
-    anew = _noise_of(model, paths.states, words[4 + 2 * d :])
+    one, other = (take(pilot, (p * place).astype(jnp.int32)) for place in pair)
+    places = to_places(flat + select_rows(kind < OF_WALKS, walk, one - other))
+    noise = _noise_of(model, paths.states, words[3 + 2 * d :])
     if _is_of_noise(model):
-        anew = KEPT_NOISE * now + np.sqrt(1 - KEPT_NOISE**2) * anew
-    now = select_rows(moves_noise, anew, now)
-    return places, jax.lax.dynamic_update_index_in_dim(paths.noise, now, s, 1), moves_noise
+        now = jax.lax.dynamic_index_in_dim(paths.noise, t - 1, 1, False)
+        noise = KEPT_NOISE * now + np.sqrt(1 - KEPT_NOISE**2) * noise
+    noise = jax.lax.dynamic_update_index_in_dim(paths.noise, noise, t - 1, 1)
+    at_start = _unseen(places, paths.noise, _initial(model, places))
+    at_step = paths._replace(noise=noise, states=paths.before, log_last=at_start.log_last)
+    return jax.tree.map(partial(jnp.where, is_of_noise), at_step, at_start)
