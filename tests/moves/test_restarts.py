@@ -2,6 +2,7 @@
 
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +16,7 @@ from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_s
 from tests.marking import quick_of
 from tests.moves.start.test_start import KEY, SEEN, mean
 from tests.moves.start.test_window import PLANE, WithKeys
-from tests.unbiased import assert_unbiased
+from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import ScalarLinear
 
 MODEL = ScalarLinear()
@@ -31,13 +32,13 @@ FILTER = mpfjax.with_restarts(
 )
 
 
-def log_evidence_with_a_restart():
-    """log p(y), where the state began anew after the sixth step with probability p."""
+def log_evidence_with_a_restart(seen, carried, model=PLANE):
+    """log p(y), where the state began anew after so many steps with probability p."""
     alone, before, after = (
-        float(kalman_filter(PLANE, part).log_marginal_likelihood)
-        for part in (CARRIED, CARRIED[:6], CARRIED[6:])
+        kalman_filter(model, part).log_marginal_likelihood
+        for part in (seen, seen[:carried], seen[carried:])
     )
-    return np.logaddexp(np.log1p(-PROBABILITY) + alone, np.log(PROBABILITY) + before + after)
+    return jnp.logaddexp(np.log1p(-PROBABILITY) + alone, np.log(PROBABILITY) + before + after)
 
 
 @pytest.mark.parametrize("islands", quick_of([1, 2], [1]))
@@ -56,12 +57,41 @@ def test_evidence_and_moments_are_those_of_a_state_that_began_anew(islands):
     surprised = np.asarray(runs.surprised)
     assert surprised[:, 6:8].all()
     assert not surprised[:, 8:].any()
-    log_z = log_evidence_with_a_restart()
-    ratios = np.exp(np.asarray(runs.log_marginal_likelihood) - log_z)
+    ratios = ratios_to(log_evidence_with_a_restart(CARRIED, 6), runs)
     assert_unbiased(ratios, 1.0, loosest=0.05, errors=3.0)
     if islands == 1:
         means = kalman_filter(PLANE, CARRIED[6:]).means[-1]
         assert_unbiased(ratios[:, None] * np.asarray(runs.collected)[:, -1], means, loosest=0.5)
+
+
+@pytest.mark.weekly
+def test_a_restart_may_reach_back_into_the_start():
+    """The third observation belongs to both windows."""
+    seen = np.concatenate([SEEN[:2], SEEN - 12.0, SEEN[-1:] - 12.0])
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 200), FILTER, seen, mean)
+    assert (np.asarray(runs.surprised).argmax(axis=1) == 2).all()
+    assert_unbiased(ratios_to(log_evidence_with_a_restart(seen, 2), runs), loosest=0.1)
+
+
+@pytest.mark.weekly
+def test_the_gradient_through_a_restart_is_the_score():
+    """Of the nine observations up to the restart, the last three of which are its own."""
+    seen = CARRIED[:9]
+
+    def at(scale):
+        return eqx.tree_at(lambda m: m.P0, PLANE, scale * PLANE.P0)
+
+    @jax.grad
+    def score(scale, key):
+        plain = mpfjax.particle_filter(at(scale), 150, gradient="stop")
+        restarts = {"probability": PROBABILITY, "num_observations": 3}
+        filter = mpfjax.with_restarts(mpfjax.with_start(plain, 3), **restarts)
+        return mpfjax.run_filter(key, filter, seen, mean).log_marginal_likelihood
+
+    run = jax.jit(lambda keys: jax.lax.map(lambda key: score(1.0, key), keys))
+    scores = run(jax.random.split(KEY, 600))
+    expected = jax.grad(lambda scale: log_evidence_with_a_restart(seen, 6, at(scale)))(1.0)
+    assert_unbiased(scores, float(expected), loosest=0.25)
 
 
 @pytest.mark.parametrize("log_new", [-3.0, 400.0])
