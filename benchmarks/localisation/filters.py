@@ -111,6 +111,9 @@ FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
     "the same, with_restarts": lambda model, n, m: mpfjax.with_restarts(
         mpfjax.with_start(mixture(model, n, m))
     ),
+    "with_start, equal slots": lambda model, n, m: mpfjax.with_start(
+        mpfjax.with_resampling(mixture(model, n, m), mpfjax.Resample(allocation="equal"))
+    ),
 }
 NAMES = [*FILTERS, *([PEER] if importlib.util.find_spec("blackjax") else [])]
 
