@@ -123,7 +123,7 @@ def drawn_runs(
     filters = recipes.PRESETS[preset](still, source.boxes)
 
     def rows(shots: list[Snapshot], **how: bool) -> list[np.ndarray]:
-        return [track_rows(shots, run, source.first, **how) for run in range(len(keys))]
+        return [track_rows(shots, run, first=source.first, **how) for run in range(len(keys))]
 
     runs = {name: (follow(keys, each, source.read()), rows) for name, each in filters.items()}
     return runs, source
