@@ -303,6 +303,7 @@ class Heading(mpfjax.AbstractStateSpaceModel):
         return -0.5 * ((observation - jnp.sin(states)) / 0.1) ** 2
 
 
+@pytest.mark.exactness
 def test_mixtures_know_the_periods_of_their_model(tmp_path):
     series = mpfjax.Series.skipping(np.array([0.0, np.nan, 0.05, 0.0]))
     plain = mpfjax.mixture_particle_filter(Heading(), 60, 3)

@@ -107,7 +107,7 @@ def log_errors(name, filter):
     return np.cumsum(gaps, axis=1), np.asarray(run.collected)
 
 
-@pytest.mark.parametrize("name", quick_of(CASES, [], one_in=4))
+@pytest.mark.parametrize("name", quick_of(CASES, [], one_in=7))
 def test_evidence_and_means_are_unbiased_at_every_step_and_the_noise_is_less(name):
     """E[Ẑ/Z] = 1 and E[Ẑ/Z E[x]] = E[x | y] within four standard errors."""
     found, means = log_errors(name, learned(name))

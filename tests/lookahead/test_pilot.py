@@ -51,7 +51,7 @@ def test_where_a_step_is_narrow_three_quarters_of_the_likelihood_are_trusted():
     np.testing.assert_allclose(found, 1 / 4 + 3 / 4 * likelihoods / likelihoods.mean(), rtol=1e-2)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_it_lowers_the_mean_squared_error_of_log_z_on_the_mirror_image():
     """With keys that nothing was chosen on; a third of the variance is expected."""
     model, num_runs = Mirror(), 120

@@ -13,7 +13,7 @@ from mpfjax.exact import kalman_filter
 from mpfjax.mixture import single_component
 from mpfjax.moves.alarm import is_alarmed
 from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_sums
-from tests.marking import quick_of
+from tests.marking import weekly
 from tests.moves.start.test_start import KEY, SEEN, mean
 from tests.moves.start.test_window import PLANE, WithKeys
 from tests.unbiased import assert_unbiased, ratios_to
@@ -41,7 +41,7 @@ def log_evidence_with_a_restart(seen, carried, model=PLANE):
     return jnp.logaddexp(np.log1p(-PROBABILITY) + alone, np.log(PROBABILITY) + before + after)
 
 
-@pytest.mark.parametrize("islands", quick_of([1, 2], [1]))
+@pytest.mark.parametrize("islands", [1, *weekly([2])])
 def test_evidence_and_moments_are_those_of_a_state_that_began_anew(islands):
     """Of a start by the first three observations, and one by those from the seventh on."""
 

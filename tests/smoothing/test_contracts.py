@@ -106,7 +106,7 @@ def expected_rows(smoother, name, length):
     return np.array([exact_terms(name, s + 1)[r] for r, s in enumerate(settled)]), settled
 
 
-@pytest.mark.parametrize(("name", "chain", "model"), quick_of(CASES, QUICK_CASES, one_in=6))
+@pytest.mark.parametrize(("name", "chain", "model"), quick_of(CASES, QUICK_CASES, one_in=20))
 def test_means_covariances_and_pairs_are_the_exact_ones(name, chain, model):
     """Times Ẑ/Z every estimate is unbiased: within four standard errors."""
     smoother = SMOOTHERS[name]

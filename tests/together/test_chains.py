@@ -14,7 +14,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter
-from tests.marking import exactness, quick_of
+from tests.marking import exactness, quick_of, weekly
 from tests.registry import CHAINS, NUM_PARTICLES, QUICK_CHAINS
 from tests.unbiased import assert_unbiased
 from tests.user_models import (
@@ -92,9 +92,10 @@ EXACT = [
     *quick_of(
         [(chain, "quadratic", None) for chain in CHAINS if chain not in APPROXIMATE],
         [(chain, "quadratic", None) for chain in COVERING],
-        one_in=3,
+        one_in=8,
     ),
-    *exactness(OTHERWISE),
+    *exactness(OTHERWISE[::4]),
+    *weekly([each for each in OTHERWISE if each not in OTHERWISE[::4]]),
 ]
 
 

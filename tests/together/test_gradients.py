@@ -12,7 +12,7 @@ from mpfjax import Filter, Propagate, Resample, Step, with_score_gradient
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from tests.examples import example_mixtures
-from tests.marking import quick_of
+from tests.marking import quick_of, weekly
 from tests.unbiased import assert_unbiased
 from tests.user_models import BLINDED, ScalarLinear
 
@@ -95,7 +95,7 @@ def deviations(name, transform):
     return found
 
 
-@pytest.mark.parametrize("name", quick_of(FILTERS, ["pf"], one_in=2))
+@pytest.mark.parametrize("name", quick_of(FILTERS, ["pf"], one_in=4))
 def test_stop_gradient_scores_are_unbiased(name):
     """∇Ẑ = Ẑ ∇log Ẑ is an unbiased estimate of ∇Z, for any number of particles."""
     found = deviations(name, (lambda f: f) if name == "pathwise" else with_score_gradient)
@@ -174,7 +174,7 @@ def gaussian_mixture_of(model, m):
 # label or a shift is a constant in every order of differentiating.
 @pytest.mark.exactness
 @pytest.mark.parametrize(
-    ("make", "m"), [(mixture_of, 3), (mixture_of, 6), (gaussian_mixture_of, 6)]
+    ("make", "m"), [(mixture_of, 3), *weekly([(mixture_of, 6), (gaussian_mixture_of, 6)])]
 )
 def test_first_and_second_derivatives_are_the_same_in_both_modes(make, m):
     def log_evidence(sigma):

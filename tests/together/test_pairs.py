@@ -71,7 +71,7 @@ def mean_of(mixture):
 
 
 @pytest.mark.filterwarnings("ignore:at the end, what was observed")
-@pytest.mark.parametrize(("first", "second", "islands"), quick_of(PAIRS, QUICK, one_in=4))
+@pytest.mark.parametrize(("first", "second", "islands"), quick_of(PAIRS, QUICK, one_in=16))
 def test_evidence_and_mean_are_exact(first, second, islands):
     pair = first, second
     filter, series = filter_of(pair), mpfjax.Series.skipping(OBSERVATIONS)

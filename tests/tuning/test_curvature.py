@@ -60,7 +60,7 @@ def exact_errors(names):
     return dict(zip(names, np.sqrt(np.diag(np.linalg.inv(information))), strict=True))
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_numbers_of_very_different_units_have_their_exact_errors():
     """Standard errors from 1e-4 to 1e3, none of them by a transform."""
     units, names = (1e3, 1e-3), ("a", "m", "r")

@@ -8,7 +8,7 @@ import pytest
 import mpfjax
 from mpfjax import Series
 from mpfjax.tuning import Interval, Positive, metropolis_hastings, particle_gibbs, sequential, smc2
-from tests.marking import exactness
+from tests.marking import weekly
 from tests.tuning.exact_posteriors import (
     DEVIATION_OF_LOG_SIGMA,
     INPUTS,
@@ -83,7 +83,7 @@ def by_gibbs_through_a_mixture():
     "sample",
     [
         by_gibbs,  # Metropolis-Hastings and SMC² have theirs in `test_exact_answers.py`
-        *exactness([by_metropolis, by_metropolis_steps_within_gibbs, by_gibbs_through_a_mixture]),
+        *weekly([by_metropolis, by_metropolis_steps_within_gibbs, by_gibbs_through_a_mixture]),
     ],
 )
 def test_chains_have_the_exact_mean_and_variance(sample):
@@ -138,7 +138,7 @@ def through_a_mixture(key):
     return run, np.log(run.parameters["sigma_y"]), posterior_of_log_sigma()
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 @pytest.mark.parametrize("sample", [growing, through_a_mixture])
 def test_smc2_has_the_exact_evidence_mean_and_variance(sample, monkeypatch):
     """Over independent runs: estimates times the estimated evidence have no bias."""

@@ -20,7 +20,7 @@ from mpfjax.tuning import (
     smc2,
 )
 from mpfjax.tuning.evidence import pose_evidence
-from tests.marking import exactness
+from tests.marking import weekly
 from tests.tuning.exact_posteriors import Pushed
 
 KEY, NUM_STEPS = jax.random.key(0), 3
@@ -120,7 +120,7 @@ def z_scores(values, mean, variance, independent=None):
     return moments.mean(axis=(1, 2)) / error[:, 0]
 
 
-@pytest.mark.parametrize("sample", [by_metropolis, *exactness([by_gibbs, by_smc2])])
+@pytest.mark.parametrize("sample", [by_metropolis, *weekly([by_gibbs, by_smc2])])
 def test_means_and_variances_are_the_exact_ones(sample):
     """Within four standard errors, over chains; of `smc2`, by its effective sample size."""
     run = sample()

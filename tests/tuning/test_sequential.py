@@ -84,7 +84,7 @@ def interrupt_at(monkeypatch, step):
     monkeypatch.setattr(observing, "extended", interrupted)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_interrupted_and_resumed_the_samples_are_those_of_one_run(tmp_path, monkeypatch):
     """Also to observations that were not there before, and where N has doubled meanwhile."""
     with_thresholds(monkeypatch, acceptance=1.0)

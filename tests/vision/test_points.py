@@ -6,6 +6,7 @@ import pytest
 from mpfjax.vision import Detections, ObjectTracker, track
 from mpfjax.vision.tracking.track import online_rows
 from mpfjax.vision.tracking.vectors import Likeness, cosine_distances
+from tests.marking import weekly
 
 SIGMA = 2.0
 
@@ -104,7 +105,7 @@ def right_after_a_meeting(crosses, with_vectors, seed):
     return kept[20] == kept[-1]
 
 
-@pytest.mark.parametrize("with_vectors", [False, True])
+@pytest.mark.parametrize("with_vectors", [*weekly([False]), True])
 def test_look_alikes_in_motion_are_told_apart_by_their_vectors(with_vectors):
     kept = [right_after_a_meeting(way, with_vectors, seed) for way in (0, 1) for seed in range(4)]
     assert all(kept) == with_vectors

@@ -75,6 +75,7 @@ def test_a_checkpoint_within_the_window_goes_on_to_the_bit(tmp_path):
     chex.assert_trees_all_equal(*both)
 
 
+@pytest.mark.weekly
 def test_runs_at_different_steps_are_as_alone():
     """One is within the window, and one beyond it."""
     mixtures = [FILTER.init(KEY, SEEN[0])]
@@ -90,7 +91,7 @@ def test_runs_at_different_steps_are_as_alone():
         np.testing.assert_allclose(of_run.mean(), alone.mean(), rtol=1e-4)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_inputs_of_each_step_are_those_of_the_window():
     log_z, filtered, _ = truth()
     filter = mpfjax.with_start(mpfjax.particle_filter(Driven(), 100), LENGTH)
@@ -140,7 +141,7 @@ def test_the_gradient_is_the_score():
     assert_unbiased(scores, float(jax.grad(log_z)(1.0)), loosest=0.25)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_islands_have_the_masses_of_their_own_starts():
     def run(key):
         return mpfjax.run_islands(key, FILTER.replace(num_particles=50), SEEN, mean, num_islands=2)
