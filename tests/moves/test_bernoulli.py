@@ -190,6 +190,7 @@ def test_one_scan_is_that_of_all_associations(apart):
     np.testing.assert_allclose(info.log_likelihood_increment, log_evidence, atol=close)
 
 
+@pytest.mark.exactness
 def test_a_known_single_object_is_that_of_all_associations():
     """And E[x_t]; with certain detection and hardly any clutter it is the Kalman filter's."""
     alone = {"rate": 1e-12, "survival_probability": 1.0}
@@ -293,6 +294,7 @@ def test_objects_not_detected_yet_are_those_of_gaussian_sums(proposal):
     np.testing.assert_allclose(log_z.mean(), log_evidence + log_total, atol=0.03)
 
 
+@pytest.mark.exactness
 def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
     """One object that may exist, against the product of the sensors' likelihoods."""
     near = ClutteredModel(OBJECT, lambda states: jnp.where(states[:, 0] < 1, 0.9, 0.0), CLUTTER)
@@ -331,6 +333,7 @@ def test_two_components_of_one_object_become_one():
         assert found.labels.tolist() == [1, 2 if expected[1] else 0]
 
 
+@pytest.mark.exactness
 def test_derivatives_of_the_evidence():
     """By p_D, log λ and log R, over scans; against differences, in the mean over keys."""
     targets = model(0.3, initial_number=1.0)

@@ -42,6 +42,7 @@ def log_evidence_with_a_restart(seen, carried, model=PLANE):
 
 
 @pytest.mark.parametrize("islands", [1, *weekly([2])])
+@pytest.mark.exactness
 def test_evidence_and_moments_are_those_of_a_state_that_began_anew(islands):
     """Of a start by the first three observations, and one by those from the seventh on."""
 

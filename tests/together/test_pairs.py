@@ -49,7 +49,7 @@ PAIRS += [(*pair, 1) for name in BESIDE_FIRST for pair in ((FIRST, name), (name,
 PAIRS += [(FIRST, "restarts", NUM_ISLANDS)]
 TRANSFORMS[FIRST] = lambda filter: mpfjax.with_start(filter, 1)
 # Each kind of fault that there was: looks ahead, starts and islands beside restarts.
-QUICK = [("start", "look-ahead", 1), ("start", "restarts", 2)]
+QUICK = [("start", "look-ahead", 1)]
 
 
 LINEAR = mpfjax.LinearGaussianModel(

@@ -38,6 +38,7 @@ def mean(mixture):
     return mixture.mean()
 
 
+@pytest.mark.exactness
 def test_evidence_and_moments_are_unbiased_beyond_the_window():
     """Two observations are missing, the first among them."""
     series = mpfjax.Series.skipping(GAPS)

@@ -78,6 +78,7 @@ class WithKeys(mpfjax.AbstractStateSpaceModel):
 
 
 @pytest.mark.parametrize("model", [WithKeys(), *weekly([PLANE])], ids=["keys", "noise"])
+@pytest.mark.exactness
 def test_evidence_and_moments_are_unbiased(model):
     """The third observation is missing."""
     states, log_z = starts(model, window_of(PLACES, PRESENT), 100, 300)
