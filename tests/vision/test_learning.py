@@ -263,3 +263,17 @@ def test_who_never_leaves_a_neighbour_before_it_ends_is_a_double():
 
     assert many(together, ends=True).doubtful.tolist() == [False, True]
     assert not many(np.eye(2), ends=True).doubtful.any()
+
+
+def test_pairs_of_the_cameras_motion_do_not_widen_with_its_deviation():
+    """A camera believed to shake by half a box tells nothing by detections that fit no object."""
+    tracker = ObjectTracker(8, frames_per_second=10)
+    boxes = np.array([[100.0 * k, 50.0, 40.0, 80.0] for k in range(4)])
+    state = tracker.init()
+    for _ in range(8):
+        state, tracks = tracker.step(None, state, None, boxes)
+    assert tracks.shown.all()
+    believed = state.camera._replace(deviations=np.full(2, 0.45), left=np.full(2, 0.45))
+    away = np.array([[24.0, 0, 0, 0], [-24.0, 0, 0, 0], [0, 48.0, 0, 0], [0, -48.0, 0, 0]])
+    after, _ = tracker.step(None, state._replace(camera=believed), None, boxes + away)
+    np.testing.assert_array_equal(after.camera.deviations, believed.deviations)
