@@ -8,7 +8,7 @@ import pytest
 
 from mpfjax.vision.colour.histograms import bhattacharyya
 from mpfjax.vision.tracking.associate import (
-    learned_colours,
+    learned_descriptors,
     mahalanobis,
     marginals,
     one_to_one,
@@ -138,7 +138,7 @@ def test_colours_are_learned_from_who_stands_alone():
     known = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
     seen = np.array([[0.0, 1.0], [0.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
     alone = np.array([False, True, False, True])
-    after = learned_colours(known, seen, alone)
+    after = learned_descriptors(known, seen, alone)
     np.testing.assert_allclose(after, [[0, 1], [0.86, 0.14], [1, 0], [1, 0]], rtol=1e-6)
 
 

@@ -34,7 +34,7 @@ def unlikeness(
     return np.where(np.any(known, axis=1, keepdims=True), cost, 0.0)
 
 
-def learned_colours(
+def learned_descriptors(
     known: Float[np.ndarray, "m bins"],
     seen: Float[np.ndarray, "m bins"],
     alone: Bool[np.ndarray, " m"],

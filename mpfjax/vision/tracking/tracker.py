@@ -12,7 +12,7 @@ from mpfjax.vision.colour.histograms import sampled_histograms
 from mpfjax.vision.tracking.associate import (
     TEMPERATURE,
     compatible,
-    learned_colours,
+    learned_descriptors,
     mahalanobis,
     one_to_one,
     probabilities,
@@ -301,15 +301,15 @@ def advanced(
     duplicates = state.duplicates.after(lives.identities, stays, taken.there, overlaps)
     lives = lives._replace(shown=lives.shown & ~duplicates.doubtful)
     colours, vectors = (
-        np.append(known[stays], np.zeros((len(born), known.shape[1])), axis=0)
-        for known in (state.colours, state.vectors)
+        np.append(held[stays], np.zeros((len(born), held.shape[1])), axis=0)
+        for held in (state.colours, state.vectors)
     )
     alone = np.sum(overlaps > _CONTACT, axis=1) <= 1  # each overlaps itself
     if found.colours is not None:
-        colours = learned_colours(colours, taken.values(found.colours, 0.0), alone)
+        colours = learned_descriptors(colours, taken.values(found.colours, 0.0), alone)
     likeness, clutter = state.likeness, state.clutter
     if found.vectors is not None:
-        vectors = learned_colours(vectors, taken.values(found.vectors, 0.0), alone)
+        vectors = learned_descriptors(vectors, taken.values(found.vectors, 0.0), alone)
         likeness = likeness.after(distances, source[:, None] == np.arange(len(places)))
     if not is_boxes:
         clutter = clutter.after(places, len(places) - len(rows) if state.begun else 0)
