@@ -12,7 +12,6 @@ import pytest
 import mpfjax
 from mpfjax import Filter, Propagate, Resample
 from mpfjax.exact import kalman_filter
-from tests.marking import exactness
 from tests.registry import CHAINS
 from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import (
@@ -39,6 +38,7 @@ def mean(mixture):
     return mixture.mean()
 
 
+@pytest.mark.exactness
 def test_one_component_is_the_particle_filter_to_the_bit():
     mixture = mpfjax.mixture_particle_filter(QUADRATIC, PF.num_particles, 1, regroup_every=1)
     runs = [mpfjax.run_filter(KEY, filter, OBSERVATIONS) for filter in (PF, mixture)]
@@ -52,6 +52,7 @@ def test_a_start_is_what_its_parts_give_one_after_the_other():
     chex.assert_trees_all_equal(filter.init(KEY), filter._init(KEY))
 
 
+@pytest.mark.exactness
 def test_collect_decides_what_is_kept():
     whole = mpfjax.run_filter(KEY, PF, OBSERVATIONS)
     means = mpfjax.run_filter(KEY, PF, OBSERVATIONS, mean)
@@ -61,6 +62,7 @@ def test_collect_decides_what_is_kept():
     chex.assert_trees_all_equal(last, whole.final)
 
 
+@pytest.mark.exactness
 def test_three_methods_are_enough_for_any_pytree_of_states_and_observations():
     class Minimal(mpfjax.AbstractStateSpaceModel):
         def sample_initial(self, key, num_particles):
@@ -80,6 +82,7 @@ def test_three_methods_are_enough_for_any_pytree_of_states_and_observations():
     assert np.isfinite(run.log_marginal_likelihood)
 
 
+@pytest.mark.exactness
 def test_a_move_may_be_any_function():
     given = []
 
@@ -99,6 +102,7 @@ def test_a_move_may_be_any_function():
     assert given[-1].propagation.noise == "independent"
 
 
+@pytest.mark.exactness
 def test_the_mass_of_a_mixture_given_by_hand_counts_once_whatever_moves_leave_the_weights():
     """A move that returns the weights that it was given is not normalised again."""
 
@@ -115,6 +119,7 @@ def test_the_mass_of_a_mixture_given_by_hand_counts_once_whatever_moves_leave_th
         np.testing.assert_allclose(mixture.log_mass, 0, atol=1e-5)
 
 
+@pytest.mark.exactness
 def test_resampling_is_reported_where_it_happens():
     filter = mpfjax.particle_filter(QUADRATIC, 48, ess_threshold=0.5)
     run = mpfjax.run_filter(KEY, filter, jnp.tile(OBSERVATIONS, 3))
@@ -131,11 +136,12 @@ BOTH = eqx.tree_at(
 )
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(
     ("model", "linear", "observations"),
     [
         (TwoSensors(), BOTH, [[1.0, np.nan], [np.nan, 0.3], [0.4, 0.1]]),
-        *exactness([(LINEAR, LINEAR, [[1.0], [np.nan], [0.3]])]),
+        (LINEAR, LINEAR, [[1.0], [np.nan], [0.3]]),
     ],
     ids=["one of two sensors", "a step"],
 )
@@ -152,6 +158,7 @@ def test_what_is_missing_is_skipped_as_the_kalman_filter_does(model, linear, obs
     assert not np.asarray(run.resampled)[:, nothing_seen].any()
 
 
+@pytest.mark.exactness
 def test_broken_and_impossible_densities_within_a_run():
     filter, keys = CHAINS["kmeans only"](QUADRATIC), jax.random.split(KEY, 2)
     run = mpfjax.run_filter(KEY, filter, OBSERVATIONS.at[1].set(BLINDED))
@@ -181,6 +188,7 @@ def test_slots_are_one_program_whatever_the_number_of_particles():
 
 
 class TestParameters:
+    @pytest.mark.exactness
     def test_there_is_one_copy_of_the_models_parameters(self):
         for chain, build in CHAINS.items():
             model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
@@ -188,6 +196,7 @@ class TestParameters:
             parameters = jax.tree.leaves(eqx.filter(build(model), eqx.is_inexact_array))
             assert len(parameters) == len(jax.tree.leaves(model)) == 2, chain
 
+    @pytest.mark.exactness
     def test_changing_the_filters_model_changes_its_moves(self):
         """Of the dynamics and of the guide: as if the filter had been made for the other model."""
         make = CHAINS["guided mpf"]
@@ -233,6 +242,7 @@ RUNNERS = {
 }
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("run", RUNNERS.values(), ids=RUNNERS)
 def test_floats_of_a_model_are_no_constants_of_the_program(run):
     found = [run(mpfjax.particle_filter(Walk(0.5, 0.3), 10))]
@@ -242,6 +252,7 @@ def test_floats_of_a_model_are_no_constants_of_the_program(run):
     assert len({float(jax.tree.leaves(each)[0].sum()) for each in found}) == 3
 
 
+@pytest.mark.exactness
 def test_floats_that_python_asks_for_stay_python_floats():
     for phi in (0.0, 0.9):
         filter = mpfjax.particle_filter(Branching(phi, 0.3), 10)
@@ -255,6 +266,7 @@ def by_globals():
     return lambda mixture: globals()["UNIT"] * mixture.mean()
 
 
+@pytest.mark.exactness
 def test_functions_are_the_same_if_they_are_the_same_object(monkeypatch):
     """One text written twice sees what it names each time; one object compiles once."""
 
@@ -326,6 +338,7 @@ def test_mixtures_know_the_periods_of_their_model(tmp_path):
     assert abs(mpfjax.load_checkpoint(tmp_path / "at", moved).mean()) > 2.8
 
 
+@pytest.mark.exactness
 def test_a_dead_component_has_no_mean_and_hides_nothing():
     mixture = mpfjax.mixture_particle_filter(Heading(), 60, 3).init(KEY)
     mixture = mixture.replace(component_indicators=jnp.ones(60, jnp.int32))

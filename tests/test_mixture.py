@@ -65,6 +65,7 @@ def test_quantiles_are_those_of_the_weighted_distribution_function(mixture):
     np.testing.assert_array_equal(median, jnp.full(3, found[3, 0]))
 
 
+@pytest.mark.exactness
 def test_what_goes_round_is_averaged_on_its_circle():
     """A pose, in both forms of its state, against complex numbers."""
     periods, rng = np.array([0.0, 4.0, 2 * np.pi], np.float32), np.random.default_rng(3)

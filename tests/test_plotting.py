@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import numpy as np
+import pytest
 from matplotlib.collections import LineCollection
 
 import mpfjax
@@ -15,6 +16,7 @@ def segments_of(collection):
     return collection.get_segments() if isinstance(collection, LineCollection) else []
 
 
+@pytest.mark.exactness
 def test_components_stand_where_their_moments_are():
     """A dot at each living component's mean; bars hold deviations within particles and between."""
     by_regime = [mpfjax.GroupBy(lambda state: state.latent)]

@@ -40,6 +40,7 @@ def final(filter):
     return mpfjax.run_filter(KEY, filter, OBSERVATIONS).final
 
 
+@pytest.mark.exactness
 def test_the_keywords_of_recipes_are_transforms():
     plain = mpfjax.particle_filter(MODEL, 32)
     for keywords, transform in (
@@ -84,6 +85,7 @@ def test_point_sets_sort_the_chains_own_resampling_alone():
     assert kept.moves[0].sort_by is own.sort_by
 
 
+@pytest.mark.exactness
 def test_a_look_ahead_and_proposals_are_put_on_and_taken_off():
     plain = mpfjax.particle_filter(MODEL, 16)
     guide = mpfjax.GaussNewtonProposal()
@@ -98,6 +100,7 @@ def test_a_look_ahead_and_proposals_are_put_on_and_taken_off():
     chex.assert_trees_all_equal(final(with_selected_start(plain, 1)), final(plain))
 
 
+@pytest.mark.exactness
 def test_a_filter_is_replaced_by_its_own_arguments():
     other = mpfjax.QuadraticModel(0.1, 0.5, -2.0, 2.0)
     filter = with_selected_start(own_chain(), 3)

@@ -15,15 +15,13 @@ from benchmarks.partitioned_sampling.posterior import distance_maps
 from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.colour.bins import RGBColours
 from mpfjax.vision.colour.histograms import integral_histogram
-from tests.marking import exactness
 from tests.precision import float64
 
 NOISE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
 
 
-@pytest.mark.parametrize(
-    "name", ["terrain", *exactness(["bearings", "corridor", "mirror", "jumps"])]
-)
+@pytest.mark.exactness
+@pytest.mark.parametrize("name", ["terrain", "bearings", "corridor", "mirror", "jumps"])
 def test_noise_and_draws_have_one_law(name):
     """Of x_0 and of a step: the draws of the model and those from noise, by their moments."""
     model, n = SCENES[name][0](2, 0).model, 20_000
@@ -76,6 +74,7 @@ def test_maps_are_counted_pixel_by_pixel():
 # --- colours and boxes --------------------------------------------------------------------------
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(("num_bins", "num_parts"), [(16, 1), (30, 4)])
 def test_the_limit_of_soft_histograms_is_the_hard_one(num_bins, num_parts):
     """With a point on every pixel, on noise, where no blur would go unseen."""
@@ -86,6 +85,7 @@ def test_the_limit_of_soft_histograms_is_the_hard_one(num_bins, num_parts):
     np.testing.assert_allclose(soft * 144 / num_parts, hard, atol=1e-3)
 
 
+@pytest.mark.exactness
 def test_derivatives_of_the_soft_model_are_those_of_differences():
     boxes = np.array([[10.0, 8, 12, 16], [35, 12, 12, 20]])
     model = SoftColourModel.from_frame(NOISE, boxes, num_bins=8, num_points=4, num_parts=2)
@@ -116,6 +116,7 @@ def row(frame, id, x, y=0.0):
     return [frame, id, x, y, 10.0, 20.0]
 
 
+@pytest.mark.exactness
 def test_coverage_strays_and_swaps_by_hand():
     objects = np.array([row(t, id, 100 * id) for t in (1, 2, 3, 4) for id in (1, 2)])
     places = ((1, 7, 100), (1, 8, 200), (2, 7, 100), (2, 8, 500), (3, 8, 200), (4, 9, 200))

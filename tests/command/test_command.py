@@ -191,6 +191,7 @@ def test_an_interrupt_leaves_what_was_done(given, tmp_path, monkeypatch, capsys)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == older
 
 
+@pytest.mark.exactness
 def test_an_interrupt_ends_the_commands_own_process_at_once():
     """Past JAX's cleaning up, which a trace that was broken off can bring down."""
     code = (

@@ -109,6 +109,7 @@ def test_a_missing_number_is_no_error_to_jax_debug_nans(reference):
     assert debugged.log_marginal_likelihood == plain.log_marginal_likelihood
 
 
+@pytest.mark.exactness
 def test_kalman_smoother_of_several_series_at_once_and_its_derivative():
     model, gaps = mpfjax.LinearGaussianModel(**MODEL), jnp.asarray(GAPS)
 
@@ -160,6 +161,7 @@ SPEEDS = {
 }  # fmt: skip
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("ratio", [1e8, 1e13])
 @pytest.mark.parametrize("name", SPEEDS)
 def test_a_diffuse_prior_leaves_the_kalman_filter_and_smoother_exact(name, ratio):
@@ -233,6 +235,7 @@ def test_the_modes_of_the_quadratic_model_have_equal_mass():
     np.testing.assert_allclose(run.mass_above(0.0), 0.5, atol=1e-4)
 
 
+@pytest.mark.exactness
 def test_both_are_differentiable():
     def by_kalman(variance):
         parts = {name: jnp.asarray(part) for name, part in SCALAR.items()}

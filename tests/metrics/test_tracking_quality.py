@@ -59,6 +59,7 @@ def test_rates_by_hand():
     np.testing.assert_array_equal(recovery_rate(both), [0.75, 0.25])
 
 
+@pytest.mark.exactness
 def test_all_measures_of_two_objects():
     """Object 0 is tracked in half, one run only; object 1 is not there in the second frame."""
     truth = jnp.broadcast_to(G, (2, 2, 4)).at[1, 1].set(jnp.nan)

@@ -63,6 +63,7 @@ CHAINS = {
 }
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("chain", quick_of(CHAINS, ["plain"]))
 def test_evidence_and_moments_are_those_of_all_associations(chain):
     exact, mean = by_associations(SETS)
@@ -75,6 +76,7 @@ def test_evidence_and_moments_are_those_of_all_associations(chain):
     assert_unbiased(ratios * np.asarray(runs.collected)[:, -1], mean, loosest=0.02)
 
 
+@pytest.mark.exactness
 def test_the_gradient_is_that_of_all_associations():
     """E[Ẑ ∂ log Ẑ] = ∂Z, for p_D and log λ, through steps without a measurement."""
 
@@ -121,6 +123,7 @@ class Bearings:
         )
 
 
+@pytest.mark.exactness
 def test_chances_and_densities_may_be_functions_and_measurements_trees_of_one_particle():
     def seen(state):
         return 0.9 * jnp.exp(-jnp.abs(state))
@@ -142,6 +145,7 @@ def test_chances_and_densities_may_be_functions_and_measurements_trees_of_one_pa
     assert missed == pytest.approx(np.log(1 - P_D))
 
 
+@pytest.mark.exactness
 def test_chances_of_nothing_and_of_all_have_derivatives_and_periods_are_the_objects():
     """∂ log L / ∂p of (1 - p) + p s is (s - 1) / L."""
     states, seen = jnp.array([[0.3]]), jnp.array([[0.4], [-2.0]])

@@ -51,6 +51,7 @@ def test_x0_is_uniform(draw):
     assert scipy.stats.kstest(states, scipy.stats.uniform(-1, 4).cdf).pvalue > 1e-3
 
 
+@pytest.mark.exactness
 def test_simulated_series_have_the_moments_of_the_joint_gaussian():
     states, observations = jax.jit(jax.vmap(lambda key: mpfjax.simulate(key, LINEAR, NUM_STEPS)))(
         KEYS
@@ -82,6 +83,7 @@ class Driven(Drift):
         return states[:, 0]
 
 
+@pytest.mark.exactness
 def test_series_of_one_particle_of_several_objects_and_with_inputs():
     states, observations = mpfjax.simulate(KEYS[0], mpfjax.per_particle(SeenOfOne()), 200)
     noise = np.asarray(observations - states[1:, 0])
@@ -121,6 +123,7 @@ class Full(DriftOfOne):
         return self.transition_mean(state) + 0.5 * noise
 
 
+@pytest.mark.exactness
 def test_a_model_of_one_particle_has_the_densities_and_means_of_the_batched_one():
     batched, wrapped = Drift(), mpfjax.per_particle(Full())
     states, previous = jax.random.normal(jax.random.key(5), (2, 6, 2))

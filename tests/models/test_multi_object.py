@@ -38,6 +38,7 @@ OWN = jnp.array([2, 0, 1, 1, 0], jnp.int32)  # an object of each particle
 
 
 class TestDensities:
+    @pytest.mark.exactness
     def test_objects_are_independent_though_their_draws_stand_in_line(self):
         """The quadratic model's x_0 are stratified, and come in ascending order."""
         model = MultiObjectModel(mpfjax.QuadraticModel(), 3)
@@ -45,6 +46,7 @@ class TestDensities:
         np.testing.assert_allclose(np.corrcoef(states.T), np.eye(3), atol=5 / np.sqrt(4000))
         np.testing.assert_allclose(np.diff(np.sort(states, axis=0), axis=0).max(), 0, atol=0.003)
 
+    @pytest.mark.exactness
     def test_log_likelihood_is_the_sum_over_objects_and_pairs(self):
         expected = np.zeros(5)
         for j, model in enumerate(OBJECTS):
@@ -57,6 +59,7 @@ class TestDensities:
         actual = MODEL.log_likelihood(OBSERVATION, STATES)
         np.testing.assert_allclose(actual, expected, rtol=1e-5)
 
+    @pytest.mark.exactness
     def test_log_transition_is_the_sum_over_objects(self):
         moved = MODEL.sample_transition(KEY, STATES)
         expected = sum(
@@ -83,6 +86,7 @@ class TestOneObjectAtATime:
         np.testing.assert_array_equal(marked[:, 1], STATES[:, 0])
         np.testing.assert_array_equal(marked[:, ::2], STATES[:, ::2])
 
+    @pytest.mark.exactness
     @pytest.mark.parametrize(
         ("object_model", "shared_observation"), [(stack(OBJECTS), False), (OBJECTS[0], True)]
     )
@@ -100,6 +104,7 @@ class TestOneObjectAtATime:
             expected = single.log_transition(state + 0.1, state)[0]
             np.testing.assert_allclose(transitions[i], expected, rtol=1e-5)
 
+    @pytest.mark.exactness
     def test_draws_follow_each_particles_own_object(self):
         """With next to no noise the draw is A_j x."""
         quiet = [
@@ -128,6 +133,7 @@ def test_a_shared_observation_is_prepared_once_for_all_objects():
 
 
 class TestWhetherParametersAreEachObjectsOwn:
+    @pytest.mark.exactness
     def test_is_found_out(self):
         assert MODEL.per_object
         assert not MultiObjectModel(OBJECTS[0], 3).per_object

@@ -76,6 +76,7 @@ def test_sobol_points_are_those_of_scipy():
     np.testing.assert_array_equal(np.asarray(points).T / 2.0**32, expected)
 
 
+@pytest.mark.exactness
 def test_a_scrambled_net_is_a_net():
     """In every grid of 2^m cells that the unscrambled points have one each in, so have these."""
     m, d = 8, 3
@@ -144,6 +145,7 @@ def assert_independent(one, other):
     assert scipy.stats.kstest(angle, "uniform").pvalue > 1e-4
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(
     ("name", "d"), [("rqmc", 1), ("one of a family", 1), *((name, 3) for name in DRAWS)]
 )
@@ -197,6 +199,7 @@ def test_noise_dealt_twice_is_independent_of_itself_and_still_a_point_set(name, 
     assert np.sqrt(np.mean(found.mean(axis=1) ** 2)) < 0.3 / np.sqrt(n)
 
 
+@pytest.mark.exactness
 def test_a_hundred_thousand_rows_stay_finite_and_uniform_ones_fill_each_cell():
     for kind in ("rqmc", "stratified"):
         noise = draw_noise(KEYS[0], kind, (100_000, 2), FLOAT)
@@ -220,6 +223,7 @@ def test_draws_of_a_particle_fill_strata_and_its_share_is_uniform_and_independen
         assert scipy.stats.kstest(both, "uniform").pvalue > 1e-4
 
 
+@pytest.mark.exactness
 def test_families_and_what_they_keep_are_one_net():
     """One of all draws in each cell of a coordinate; a draw kept by its share is even as well."""
     n, labels = 64, jnp.zeros(64, jnp.int32)

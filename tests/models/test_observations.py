@@ -32,6 +32,7 @@ def test_it_is_run_as_the_keywords_are(series):
     assert run.log_likelihood_increments[1] == 0
 
 
+@pytest.mark.exactness
 def test_within_jit_it_is_the_same():
     def run(series):
         return mpfjax.run_filter(KEY, FILTER, series).log_marginal_likelihood
@@ -65,6 +66,7 @@ class HitsAlone(Beams):
     handles_missing = False
 
 
+@pytest.mark.exactness
 def test_scans_with_infinities_are_the_models_or_are_counted(recwarn):
     scans = np.array([[1.0, np.inf, 0.9], [np.inf] * 3, [np.nan] * 3, [1.0, 1.1, np.nan]])
     for data in (scans[[0, 1, 1, 3]], Series.skipping(scans)):

@@ -65,6 +65,7 @@ def beams():
             yield (MOST if z <= LEAST else min(z, MOST)), angle
 
 
+@pytest.mark.exactness
 def test_likelihood_field_is_table_6_3():
     sensor = robots.LikelihoodField(ANGLES, laser_likelihood_max_dist=0.8, **SHARED, **WEIGHTS)
     for pose, found in zip(PLACES, sensor.log_likelihood(SCAN, POSES, GRID), strict=True):
@@ -76,6 +77,7 @@ def test_likelihood_field_is_table_6_3():
         assert found == pytest.approx(0.5 * np.log(q), rel=1e-4)
 
 
+@pytest.mark.exactness
 def test_beam_model_is_table_6_1():
     more = {"z_short": 0.05, "z_max": 0.1, "lambda_short": 0.6}
     sensor = robots.BeamModel(ANGLES, **SHARED, **WEIGHTS, **more)
@@ -94,6 +96,7 @@ def test_beam_model_is_table_6_1():
         assert found == pytest.approx(0.5 * np.log(q), rel=1e-4)
 
 
+@pytest.mark.exactness
 def test_ranges_are_those_of_small_steps():
     found = np.asarray(GRID.ranges(POSES, ANGLES, MOST))
     expected = [
@@ -107,6 +110,7 @@ def test_ranges_are_those_of_small_steps():
     assert table.ranges(centred, angles, MOST) == pytest.approx(GRID.ranges(centred, angles, MOST))
 
 
+@pytest.mark.exactness
 def test_only_used_beams_count():
     """Of nine beams three, evenly spaced; the others may say anything."""
     sensor = robots.LikelihoodField(ANGLES, laser_max_range=MOST, max_beams=3)
@@ -145,12 +149,14 @@ def robot(**options):
     return robots.RobotModel(GRID, robots.OdometryMotion(), sensor, **options)
 
 
+@pytest.mark.exactness
 def test_model_agrees_with_itself():
     mpfjax.check_model(jax.random.key(0), robot(), SCAN, inputs=jnp.array([0.3, 0.0, 0.2]))
     with pytest.raises(ValueError, match="inputs: None"):
         robot().sample_transition(jax.random.key(0), POSES)
 
 
+@pytest.mark.exactness
 def test_first_pose_is_uniform_on_free_cells():
     model = robot(clearance=0.15)
     columns, rows = np.meshgrid(np.arange(-1.05, 3.2, CELL), np.arange(1.95, 5.2, CELL))
@@ -164,6 +170,7 @@ def test_first_pose_is_uniform_on_free_cells():
     assert draws.mean(axis=0) == pytest.approx([*expected, 0], abs=4 * 1.9 / np.sqrt(20_000))
 
 
+@pytest.mark.exactness
 def test_first_pose_near_a_given_one():
     model = robot(initial_pose=(0.3, 3.1, 3.0), initial_deviations=(0.2, 0.3, 0.4))
     draws = np.asarray(model.sample_initial(jax.random.key(0), 2000))
@@ -219,6 +226,7 @@ def test_refusals():
         robot().log_likelihood(SCAN[1:], POSES)
 
 
+@pytest.mark.exactness
 def test_a_lost_robot_is_found():
     poses = np.array([-0.5, 2.8, 0.0]) + np.linspace(0, 1, 13)[:, None] * [2.9, 0.3, 0.9]
     rng = np.random.default_rng(0)
@@ -237,6 +245,7 @@ def test_a_lost_robot_is_found():
     assert abs(away[2]) < 0.15
 
 
+@pytest.mark.exactness
 @pytest.mark.real_data
 def test_public_map(data):
     """TurtleBot3's world, most of which is unknown."""

@@ -5,6 +5,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.stats import multivariate_normal
 
 import mpfjax
@@ -56,6 +57,7 @@ def test_the_evidence_and_the_smoothed_regimes_are_those_of_the_joint_normal_of_
             np.testing.assert_allclose(found[k], expected, rtol=1e-4)
 
 
+@pytest.mark.exactness
 def test_with_equal_regimes_it_is_the_kalman_filter_and_smoother_where_numbers_are_missing_too():
     model = mpfjax.SwitchingLinearGaussianModel(TRANSITIONS, **parts_of(1))
     parts = parts_of(1)
@@ -76,6 +78,7 @@ def test_with_equal_regimes_it_is_the_kalman_filter_and_smoother_where_numbers_a
         np.testing.assert_allclose(one, other, atol=1e-4)
 
 
+@pytest.mark.exactness
 def test_draws_of_regimes_follow_the_transition_matrix():
     latent = jnp.repeat(jnp.arange(NUM_REGIMES), 4000)
     noise = jax.random.normal(jax.random.key(1), (12000, 1))

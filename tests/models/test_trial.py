@@ -198,6 +198,7 @@ def is_accepted(name, num_keys, recwarn):
     return not recwarn.list
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("name", quick_of(RIGHT, QUICK, one_in=3))
 def test_what_is_right_is_accepted(name, recwarn):
     assert is_accepted(name, 8, recwarn)
@@ -267,6 +268,7 @@ WRONG = {
 }  # fmt: skip
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_wrong_is_named(name):
     base, methods, named = WRONG[name]
@@ -329,6 +331,7 @@ def test_a_run_without_any_likelihood_says_so_once(recwarn):
     assert [each.filename for each in found] == [__file__]  # the line that ran it
 
 
+@pytest.mark.exactness
 def test_a_run_in_which_one_particle_has_all_weight_says_so_once(recwarn):
     """As where the observations are in other units than the model."""
     keys, seen = jax.random.split(jax.random.key(0), 3), np.array([0.4, np.nan, 0.9, 0.1])

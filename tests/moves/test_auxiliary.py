@@ -22,6 +22,7 @@ SEEN = jnp.array([[0.8, 0.1], [1.5, 0.4], [0.1, -1.0]])
 SQUARE = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
 
 
+@pytest.mark.exactness
 def test_laplaces_approximation_is_close_where_the_state_is_well_known():
     model = mpfjax.QuadraticModel(0.1, 0.2, -2.0, 2.0)
     states = jnp.array([0.8, 1.0, 1.3, -1.1])
@@ -85,6 +86,7 @@ def test_ancestors_are_those_of_the_particles_and_the_promising_have_more():
     assert float(moved.particles.mean()) > float(MIXTURE.mean()) + 0.5
 
 
+@pytest.mark.exactness
 def test_a_look_ahead_of_zero_throughout_a_component_is_left_out():
     nothing = moved_by(lambda y, states: jnp.full(30, -jnp.inf), jnp.float32(1.5))
     plain = eqx.filter_jit(Resample())(KEY, MIXTURE)
@@ -92,6 +94,7 @@ def test_a_look_ahead_of_zero_throughout_a_component_is_left_out():
     np.testing.assert_allclose(nothing.log_weights, plain.log_weights, atol=1e-5)
 
 
+@pytest.mark.exactness
 def test_a_missing_a_broken_and_an_impossible_observation():
     def look(y, states):
         return jnp.where(

@@ -14,7 +14,7 @@ from mpfjax import ClutteredModel, Filter, TargetsModel
 from mpfjax.moves.objects.association import associate
 from mpfjax.moves.objects.bernoulli import TARGETS, Associate
 from mpfjax.moves.propagation.propagate import Predict
-from tests.marking import exactness
+from tests.marking import weekly
 from tests.models.test_clutter import SETS, by_associations
 from tests.unbiased import assert_unbiased
 
@@ -157,6 +157,7 @@ def density(z, mean, variance):
     return scipy.stats.norm.pdf(z, mean, np.sqrt(variance))
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("apart", [12.0, 1.0])
 def test_one_scan_is_that_of_all_associations(apart):
     """Existence of old and new objects, their number, and the evidence."""
@@ -249,7 +250,8 @@ class Wide(mpfjax.AbstractProposal):
         return A * previous_states + scale * noise, log_density
 
 
-@pytest.mark.parametrize("proposal", [None, *exactness([Wide()])])
+@pytest.mark.exactness
+@pytest.mark.parametrize("proposal", [None, *weekly([Wide()])])
 def test_objects_not_detected_yet_are_those_of_gaussian_sums(proposal):
     """Two scans from a Poisson number of objects, in whose second no two compete."""
     number, rate, survival = 2.0, 0.5, 0.95
@@ -319,6 +321,7 @@ def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
         filter.step(KEY, mixture, scans[0])
 
 
+@pytest.mark.exactness
 def test_two_components_of_one_object_become_one():
     """Where both may be true by their probabilities they stay, and where they are apart."""
     filter = Filter(model(1e-12), [Associate(undetected_particles=10)], 210, 3)
@@ -333,7 +336,7 @@ def test_two_components_of_one_object_become_one():
         assert found.labels.tolist() == [1, 2 if expected[1] else 0]
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_derivatives_of_the_evidence():
     """By p_D, log λ and log R, over scans; against differences, in the mean over keys."""
     targets = model(0.3, initial_number=1.0)
@@ -360,6 +363,7 @@ def test_derivatives_of_the_evidence():
         assert abs(np.mean(slope) - differences.mean()) < 4 * error + 0.03
 
 
+@pytest.mark.exactness
 def test_objects_without_room_are_told_and_the_table_has_the_rest():
     sensor = ClutteredModel(OBJECT, 0.9, 1e-4)
     crowd = TargetsModel(sensor, Birth(jnp.float32(2.0)), 0.95)
@@ -417,6 +421,7 @@ def test_the_number_is_that_of_independent_events():
     np.testing.assert_allclose(mpfjax.number_distribution(jnp.asarray(existence)), exact, atol=1e-6)
 
 
+@pytest.mark.exactness
 def test_quantiles_are_those_of_each_object():
     states = np.stack([np.linspace(0, 1, 101), np.linspace(5, 7, 101)])[..., None]
     filter = Filter(model(), [Predict(), Associate(undetected_particles=10)], 212, 3)
@@ -425,6 +430,7 @@ def test_quantiles_are_those_of_each_object():
     np.testing.assert_allclose(found.existence, [0.5, 0.25], atol=1e-6)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("region", [mpfjax.Box([-1, 0], [2, 1]), mpfjax.Disc([0.5, 0], 0.8)])
 def test_new_objects_are_even_in_a_region(region):
     """The importance weights at a measurement integrate the same density as draws anywhere."""

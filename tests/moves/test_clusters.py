@@ -51,7 +51,7 @@ def runs(filter, observations):
     return *found, np.asarray(labels)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_a_pair_that_repels_is_unbiased():
     """In some runs the pair meets at once, in others later."""
     filter, seen = mpfjax.clustered_particle_filter(PAIR, 20), OBSERVATIONS[:, :2]

@@ -66,6 +66,7 @@ def moments(counts):
     return np.concatenate([counts, products.reshape(len(counts), -1)], axis=1).astype(float)
 
 
+@pytest.mark.exactness
 @over_cases
 def test_references_by_weight_give_the_ordinary_law(case):
     """If the reference is any particle by its weight, nothing tells that one was kept."""

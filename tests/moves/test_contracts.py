@@ -81,6 +81,7 @@ def draws_of(move, mixture):
     return jax.vmap(lambda key: move(key, mixture))(keys)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(("name", "m"), quick_of(CASES, QUICK, one_in=2))
 def test_components_keep_their_mass_and_their_offspring(name, m):
     """And a slot is fed from a particle of weight, as many of them as the move says."""
@@ -154,6 +155,7 @@ def new_counts(after, num_components):
     return counts[0]
 
 
+@pytest.mark.exactness
 def test_resampling_works_with_any_pytree_of_particles():
     leaves = {"box": ORDINARY.particles, "age": (jnp.arange(40), jnp.zeros((40, 2, 3)))}
     move = Resample(sort_by=lambda states: states["box"][:, 0])

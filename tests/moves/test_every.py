@@ -29,6 +29,7 @@ def run(*moves, observations=OBSERVATIONS):
     return found, np.concatenate([initial[:, None], np.asarray(found.collected)], axis=1)
 
 
+@pytest.mark.exactness
 def test_they_run_at_the_steps_k_2k_and_so_on_and_a_missing_observation_is_no_step():
     """Without resampling nothing else changes the labels."""
     present = jnp.array([True, True, False, True, True, False, True])
@@ -47,6 +48,7 @@ def test_between_them_nothing_is_computed_for_any_seed():
     assert "cond[" in str(jax.make_jaxpr(lambda: runs(Every(3, [KMeans(5)])).collected)())
 
 
+@pytest.mark.exactness
 def test_a_label_that_dies_within_and_is_used_again_has_no_past():
     """Merge frees a label and Split takes it: what is remembered of the pair begins anew."""
     states = jnp.concatenate([jnp.full(10, 0.0), jnp.full(10, 0.01), jnp.full(10, 9.0)])
@@ -102,6 +104,7 @@ def test_a_move_that_holds_moves_forwards_all_that_they_are():
         move.check(now, 4, 3)
 
 
+@pytest.mark.exactness
 def test_a_resampling_from_time_to_time_leaves_the_choice_of_x_0_alone():
     moves = [Every(1, [mpfjax.Resample()]), Propagate()]
     filter = mpfjax.with_selected_start(mpfjax.Filter(MODEL, moves, 64), 4)

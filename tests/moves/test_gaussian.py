@@ -30,6 +30,7 @@ def draw_many(move, mixture, num_draws=NUM_DRAWS):
     return jax.vmap(lambda key: move(key, mixture))(keys)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("noise", ["independent", "stratified", "rqmc"])
 def test_draws_have_the_moments_of_their_component(noise):
     after = draw_many(GaussianRegeneration(noise=noise), MIXTURE)

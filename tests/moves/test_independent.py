@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import mpfjax
 from mpfjax import MultiObjectModel
@@ -17,6 +18,7 @@ class Lamp(mpfjax.QuadraticModel):
         return jnp.where((states > 0) & (observation > 0), -states, -jnp.inf)
 
 
+@pytest.mark.exactness
 def test_each_object_is_resampled_by_its_own_likelihood_alone():
     """A lost object does not take the others along, and log Ẑ is the sum over the objects."""
     filter = mpfjax.independent_particle_filters(MultiObjectModel(Lamp(0.1, 0.1, -1.0, 1.0), 3), 20)

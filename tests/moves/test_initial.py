@@ -44,6 +44,7 @@ def runs():
     return {k: mpfjax.monte_carlo(keys, make(k), OBSERVATIONS, nothing) for k in (1, 8)}
 
 
+@pytest.mark.exactness
 def test_evidence_and_moments_stay_unbiased_and_vary_less(runs):
     log_z = exact().log_marginal_likelihood
     errors = {k: np.mean((run.log_marginal_likelihood - log_z) ** 2) for k, run in runs.items()}
@@ -66,7 +67,7 @@ def test_the_chosen_particles_represent_the_prior(runs):
         assert_unbiased(np.sum(weights * np.asarray(function), axis=1), mean)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_particles_descend_from_those_of_the_run():
     """Without noise in the dynamics x_1 is x_0 of its ancestor, where the run says it was."""
     model = mpfjax.LinearGaussianModel(
@@ -82,6 +83,7 @@ def test_particles_descend_from_those_of_the_run():
     assert np.any(run.resampled[1])
 
 
+@pytest.mark.exactness
 def test_without_an_observation_it_does_nothing():
     gap = OBSERVATIONS.copy()
     gap[0] = np.nan
@@ -90,6 +92,7 @@ def test_without_an_observation_it_does_nothing():
     assert run.initial.log_scale == 0
 
 
+@pytest.mark.exactness
 def test_what_a_chain_weighs_before_it_propagates_counts():
     """x_0 is seen once more, with an error of 2, by a move at the head of the chain."""
 
@@ -130,6 +133,7 @@ def test_where_x_0_must_be_a_plain_draw_it_is_one():
     assert not mpfjax.with_eve_indices(chosen).weighs_initially
 
 
+@pytest.mark.exactness
 def test_impossible_and_empty_particles():
     """How far likelihoods are trusted otherwise is in `tests/lookahead/test_pilot.py`."""
     log_factors = jnp.array([[0.0, -jnp.inf, jnp.nan, 5.0], [0.0, -jnp.inf, 0.0, 5.0]])
@@ -139,6 +143,7 @@ def test_impossible_and_empty_particles():
     np.testing.assert_array_equal(trusted(jnp.full((2, 3), -jnp.inf), jnp.ones(3)), 1.0)
 
 
+@pytest.mark.exactness
 def test_a_prior_too_wide_for_its_draws_is_told(recwarn):
     """Of 800 draws on a plane hardly one is near y_1; on a line some ten are."""
     wide = mpfjax.mixture_particle_filter(WithKeys(), 200, 2)

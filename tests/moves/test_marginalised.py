@@ -13,7 +13,7 @@ from mpfjax import Filter, GroupBy, KMeans, PropagateRegimes, RegimeProposal, Re
 from mpfjax.exact import kalman_filter, switching_filter
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.moves.propagation.regimes import children
-from tests.marking import quick_of
+from tests.marking import quick_of, weekly
 from tests.precision import float64
 from tests.switching import MODEL, NUM_REGIMES, OBSERVATIONS, TRANSITIONS, moments, regimes, truth
 from tests.unbiased import assert_unbiased
@@ -72,6 +72,7 @@ def final_of(name):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), runs(name).final)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("name", quick_of(FILTERS, QUICK, one_in=2))
 def test_evidence_regimes_and_moments_are_unbiased(name):
     """E[Ẑ/Z] = 1 and E[Ẑ/Z φ̂] = E[φ | y] at every step, against all sequences of regimes."""
@@ -124,6 +125,7 @@ def assert_equals(run, exact, places=0.0):
     np.testing.assert_allclose(*increments, atol=1e-5)
 
 
+@pytest.mark.exactness
 def test_each_particle_is_a_kalman_filter_which_predicts_forecasts():
     run, exact = mpfjax.run_filter(KEY, ONE, SERIES), kalman_filter(LINEAR, SERIES)
     _, means, covariances = run.collected.particles
@@ -138,6 +140,7 @@ def test_each_particle_is_a_kalman_filter_which_predicts_forecasts():
         np.testing.assert_allclose(ahead.covariance[step, 0], covariance, atol=1e-5)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("missing", ["error", "skip"])
 def test_an_entry_that_is_missing_is_left_out_and_a_step_without_any_is_predicted(missing):
     gaps = SERIES.at[1, 0].set(jnp.nan).at[2].set(jnp.nan)
@@ -160,6 +163,7 @@ def test_inputs_reach_the_dynamics():
     assert_equals(run, kalman_filter(LINEAR, SERIES - path @ np.asarray(LINEAR.H).T), path)
 
 
+@pytest.mark.exactness
 def test_moments_of_a_mixture_are_those_of_its_gaussians():
     mixture = final_of("a component for each regime")
     state, weights = mixture.particles, np.asarray(mixture.weights, float)
@@ -208,6 +212,7 @@ def test_thousands_of_steps_in_float32_leave_covariances_positive_and_log_z_as_i
     assert np.abs(gaps.reshape(30, 100).sum(axis=1)).max() < 0.01
 
 
+@pytest.mark.exactness
 def test_with_the_optimal_proposal_all_weights_are_equal():
     filter = FILTERS["fully adapted"]()
     run = mpfjax.run_filter(KEY, filter, OBSERVATIONS, lambda mixture: mixture.log_weights)
@@ -242,8 +247,9 @@ def test_optimal_resampling_keeps_heavy_children_and_none_twice():
     assert (np.abs(light.mean(axis=0) - weights[~heavy]) <= error).all()
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(
-    "name", quick_of(["all children, by regime", "all children, in components"], QUICK)
+    "name", ["all children, by regime", *weekly(["all children, in components"])]
 )
 def test_no_child_is_kept_twice_and_every_component_keeps_its_mass(name):
     """Wherever the children stand, and whether y is there or not; unseen regimes move by T."""
@@ -285,7 +291,7 @@ def test_more_slots_than_children_stay_empty():
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize("kind", ["stop", "stop, optimal proposal", "all children"])
+@pytest.mark.parametrize("kind", ["stop", *weekly(["stop, optimal proposal", "all children"])])
 def test_derivatives_of_the_evidence_are_unbiased(kind):
     """E[∇Ẑ] = ∇Z, for a parameter of the law of z and one of the noise of x."""
 

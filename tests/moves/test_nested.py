@@ -35,6 +35,7 @@ LIKELIHOODS = jnp.array([0.0, 1.0, 2.0, 5.0])
 LABELS = np.array([0, 0, 1, 1, 1, 2])
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("noise", ["rqmc", "independent"])
 def test_weights_are_means_and_draws_are_kept_by_theirs(noise):
     """E[weight of those that keep a value] is its likelihood, for every value, one of them zero."""

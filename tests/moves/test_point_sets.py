@@ -19,7 +19,7 @@ KEY = jax.random.key(0)
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_the_error_of_the_evidence_falls_faster_than_that_of_independent_noise():
     """Sobol points in the plane, particles along a Hilbert curve; 400 runs give sd to 3.5%."""
     model, seen = DRIFT_AS_LINEAR_GAUSSIAN, jnp.linspace(-1.0, 1.5, 10)[:, None]
@@ -84,7 +84,8 @@ DEALT_ANEW = {
 QUICK = ("families",)
 
 
-@pytest.mark.parametrize("name", quick_of(DEALT_ANEW, QUICK))
+@pytest.mark.exactness
+@pytest.mark.parametrize("name", quick_of(DEALT_ANEW, QUICK, one_in=3))
 def test_errors_are_at_most_those_of_independent_noise_where_nothing_is_sorted(name):
     make, observations, collect, exact, bound = DEALT_ANEW[name]
     collected = collect or (lambda mixture: None)
@@ -95,6 +96,7 @@ def test_errors_are_at_most_those_of_independent_noise_where_nothing_is_sorted(n
     assert np.sqrt(np.mean(errors**2)) < bound / np.sqrt(SIZE)
 
 
+@pytest.mark.exactness
 def test_without_an_observation_the_noise_is_a_point_set_as_well():
     filter = mpfjax.particle_filter(QUADRATIC, 512, noise="rqmc")
     mixture = filter.init(KEY)
@@ -108,6 +110,7 @@ def resampled(mixture, sort_by):
     return Resample(sort_by=sort_by)(KEY, mixture)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("sort_by", ["hilbert", lambda x: x[:, 0] ** 3])
 def test_particles_of_a_component_stand_near_their_neighbours(sort_by):
     """The way through all particles in turn is far shorter than in the order that they had."""
@@ -137,6 +140,7 @@ def test_standardised_coordinates_make_units_immaterial():
     np.testing.assert_array_equal(*ancestors)
 
 
+@pytest.mark.exactness
 def test_components_of_one_particle_and_all_particles_at_one_point():
     propagate = eqx.filter_jit(Propagate(noise="rqmc"))
     now = mpfjax.Step(Drift(), jnp.array(0.5))

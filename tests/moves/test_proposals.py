@@ -42,6 +42,7 @@ def gaussian_fit(previous, observation):
     return information @ covariance, covariance
 
 
+@pytest.mark.exactness
 def test_the_log_density_is_that_of_the_gaussian_it_draws_from():
     proposal = GaussNewtonProposal(inflation=1.3)
     states, log_density = propose(proposal, jax.random.key(1), NOW, PREVIOUS)
@@ -55,6 +56,7 @@ def test_the_log_density_is_that_of_the_gaussian_it_draws_from():
     np.testing.assert_allclose(log_density, other, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.exactness
 def test_on_a_linear_model_the_weight_is_the_normaliser_whatever_is_drawn():
     """The locally optimal proposal: L D / q is p(y_t | x_{t-1}), which SciPy knows."""
     proposal = GaussNewtonProposal(inflation=1.0, num_iterations=1)
@@ -95,11 +97,12 @@ class TestNetworkProposal:
         exact = grid_filter(self.MODEL, self.OBSERVATIONS, jnp.linspace(-4.0, 4.0, 801))
         return np.asarray(run.log_marginal_likelihood - exact.log_marginal_likelihood, float)
 
+    @pytest.mark.exactness
     def test_the_evidence_is_unbiased_before_it_has_learned_anything(self):
         proposal = NetworkProposal.create(jax.random.key(0), 1, 1, 0.4)
         assert_unbiased(np.exp(self.log_errors(self.filter(proposal), 2000)), loosest=0.03)
 
-    @pytest.mark.exactness
+    @pytest.mark.weekly
     def test_it_learns_by_the_filters_own_bound(self):
         """It ends above where it began, and below log Z as every bound must.
 

@@ -141,12 +141,14 @@ class TestSplit:
         log_weights = np.zeros(len(states)) if log_weights is None else log_weights
         return make_mixture(states, log_weights, np.zeros(len(states)), num_components)
 
+    @pytest.mark.exactness
     def test_a_diffuse_component_splits_at_the_gap(self):
         states = np.concatenate([RNG.normal(size=70), 12 + RNG.normal(size=30)])
         found = labels_after(Split(), self.one(states[:, None]))
         # The lighter part takes the free label.
         np.testing.assert_array_equal(found, np.repeat([0, 1], [70, 30]))
 
+    @pytest.mark.exactness
     def test_a_gaussian_a_uniform_and_a_point_do_not_split(self):
         for states in (RNG.normal(size=(500, 1)), RNG.random((500, 1)), np.ones((500, 1))):
             assert (labels_after(Split(), self.one(states)) == 0).all()
@@ -182,6 +184,7 @@ class TestSplit:
         assert (free == free[:, :1]).all()
         assert len(np.unique(free)) == 4
 
+    @pytest.mark.exactness
     @pytest.mark.parametrize("room", [None, 3000, 40])
     def test_a_sample_finds_the_halves_that_all_particles_show(self, room):
         """Copies stand side by side; a part of one in 20 of a component is in a sample of 32."""
@@ -240,6 +243,7 @@ MODEL = QuadraticModel(0.3, 0.5, -2.0, 2.0)
 
 
 class TestGroupBy:
+    @pytest.mark.exactness
     @pytest.mark.parametrize("label", [-1, 2])
     def test_a_label_outside_is_a_named_error_unless_its_slot_is_empty(self, label):
         labels = np.array([0, label, 0], np.int32)
@@ -253,6 +257,7 @@ class TestGroupBy:
         with pytest.raises(RuntimeError, match="GroupBy"):
             mpfjax.run_filter(KEY, Filter(MODEL, moves, 20, 2), jnp.ones(3))
 
+    @pytest.mark.exactness
     @pytest.mark.parametrize("label", [side, lambda states: states > 0])
     def test_each_label_keeps_its_particles_however_improbable_it_is(self, label):
         """Observations of x² say nothing of the sign; a plain filter of 20 loses one."""
@@ -293,7 +298,7 @@ class FourAlike(mpfjax.AbstractStateSpaceModel):
 MODES = np.array([-30.0, -10.0, 10.0, 30.0])
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_modes_that_share_a_label_keep_their_mass():
     """E[Ẑ π_k] = Z / 4 for each of the four modes, with two labels, which run out."""
     filter = mpfjax.mixture_particle_filter(FourAlike(), 200, 2)

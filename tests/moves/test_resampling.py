@@ -13,7 +13,7 @@ from mpfjax.moves.resampling.allocation import EQUAL_PARTS, FEWEST, place_slots
 from mpfjax.moves.resampling.ancestors import SCHEMES, random_points
 from mpfjax.operations import prefix_sums
 from tests.examples import make_mixture
-from tests.marking import exactness, quick_of
+from tests.marking import quick_of
 from tests.unbiased import assert_unbiased
 
 NEARLY_ONE = 1 - 2.0**-24
@@ -70,6 +70,7 @@ def redraw_with(move):
     return redraw
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(
     ("scheme", "n", "most"),
     quick_of(
@@ -137,6 +138,7 @@ def test_means_of_many_particles_stay_where_they_are(scheme, kind, m):
     assert_unbiased(found, 0.0, slack=4e-7)
 
 
+@pytest.mark.exactness
 def test_points_stay_within_their_components_stretch_of_slots(monkeypatch):
     """The largest uniform numbers round up onto the border, which is the next component's."""
     targets = jnp.asarray([1, 25_000, 2**20, 74_999], jnp.int32)
@@ -153,6 +155,7 @@ def test_points_stay_within_their_components_stretch_of_slots(monkeypatch):
     assert ((points.fraction >= 0) & (points.fraction < 1)).all()
 
 
+@pytest.mark.exactness
 def test_components_draw_their_offsets_independently():
     log_weights = np.tile(np.log([0.05, 0.95] * 5), 2)
     mixture = make_mixture(np.arange(20.0), log_weights, np.repeat([0, 1], 10), 2)
@@ -182,6 +185,7 @@ ADAPTIVE, EQUAL, GROUPS = (
 )  # fmt: skip
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(
     ("mixture", "move", "expected"),
     [
@@ -209,6 +213,7 @@ def test_slots_are_shared(mixture, move, expected):
         assert wanted is None or abs(number - wanted) <= 1, found
 
 
+@pytest.mark.exactness
 def test_between_these_parts_as_much_is_shared_equally_as_keeps_ten_effective_particles():
     mixture = three_components((0.5, 0.5, 1e-12), (0.8, 0.8, 0.8), n=50)
     sizes = np.asarray(mixture.component_effective_sample_sizes)
@@ -217,7 +222,7 @@ def test_between_these_parts_as_much_is_shared_equally_as_keeps_ten_effective_pa
     assert abs(int(draw(Resample(), mixture).component_counts[2]) - expected) <= 1
 
 
-@pytest.mark.parametrize("n", [3, *exactness([1, 29])])
+@pytest.mark.parametrize("n", [3, 1, 29])
 def test_fewer_slots_than_components_fill_up_all_the_same(n):
     rng = np.random.default_rng(n)
     mixture = make_mixture(np.zeros((n, 1)), rng.normal(size=n), rng.integers(0, 8, n), 8)
@@ -226,6 +231,7 @@ def test_fewer_slots_than_components_fill_up_all_the_same(n):
     assert (np.asarray(found) >= np.asarray(mixture.active)).all()
 
 
+@pytest.mark.exactness
 def test_what_has_no_mass_gets_none():
     """As an island does that has died."""
     for m in (1, 6):

@@ -95,6 +95,7 @@ def test_the_gradient_through_a_restart_is_the_score():
     assert_unbiased(scores, float(expected), loosest=0.25)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("log_new", [-3.0, 400.0])
 def test_both_have_the_mass_of_their_evidence(log_new):
     """Old ones, at zero, grew by e^-4 before this step and by e^-2 in it; new ones are at one."""
@@ -145,6 +146,7 @@ def test_what_cannot_restart_is_refused():
         mpfjax.with_restarts(mpfjax.particle_filter(MODEL, 50))
 
 
+@pytest.mark.exactness
 def test_an_impossible_step_does_not_turn_the_alarm_off_for_ever():
     """It counts as much as one step can, and the alarm ends when all is right again."""
     filter = mpfjax.with_alarm(mpfjax.particle_filter(Bounded(), 200))
@@ -166,6 +168,7 @@ class Bounded(ScalarLinear):
         return jnp.where(jnp.abs(observation - states) < 30, log_density, -jnp.inf)
 
 
+@pytest.mark.exactness
 def test_a_change_of_the_model_reaches_the_alarm():
     plain, other = mpfjax.particle_filter(MODEL, 60), ScalarLinear(m=3.0)
     changed = mpfjax.with_alarm(plain).replace(model=other)
@@ -205,6 +208,7 @@ def told():
     return found
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("name", ["alarm", "restarts"])
 def test_an_alarm_is_given_where_all_hypotheses_are_wrong(name, told):
     (run, messages), (calm, silence) = told[name, True], told[name, False]
@@ -230,6 +234,7 @@ def test_the_evidence_is_that_of_the_prior_beside_the_increment(told):
     np.testing.assert_allclose(found, -np.log(40), atol=0.4)
 
 
+@pytest.mark.exactness
 def test_collect_sees_the_time_and_the_inputs():
     def collect(mixture, t, inputs):
         return t, inputs

@@ -30,7 +30,7 @@ def test_the_marginal_likelihood_is_unbiased():
     assert_unbiased(ratios_to(exact, run), loosest=0.05)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_particles_between_the_stages_follow_the_tempered_target():
     """One step of many particles, with moves enough to forget where they were drawn."""
     model = mpfjax.QuadraticModel(1.0, 4.0, -1.0, 1.0)  # which the prior tells as much as y_1

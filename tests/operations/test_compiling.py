@@ -9,7 +9,6 @@ from jax.experimental.compilation_cache import compilation_cache
 import mpfjax
 from mpfjax import keep_programs
 from mpfjax.filter import Filter
-from tests.marking import exactness
 
 SETTINGS = [
     "jax_compilation_cache_dir",
@@ -55,7 +54,8 @@ def test_the_folder_is_the_users_own_unless_jax_has_one(settings, tmp_path):
     assert getattr(jax.config, SETTINGS[0]) == str(tmp_path / "caches" / "mpfjax")
 
 
-@pytest.mark.parametrize("transformed", [eqx.Partial, *exactness([eqx.filter_jit])])
+@pytest.mark.exactness
+@pytest.mark.parametrize("transformed", [eqx.Partial, eqx.filter_jit])
 def test_a_step_raises_of_what_it_saw_and_its_program_calls_nothing_back(transformed):
     """No program with a call back into Python is kept for the next process."""
     filter = mpfjax.particle_filter(mpfjax.QuadraticModel(), 8)

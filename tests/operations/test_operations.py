@@ -40,7 +40,7 @@ from mpfjax.operations.stored import (
     to_int,
     whole_blocks,
 )
-from tests.marking import exactness, quick_of
+from tests.marking import quick_of
 from tests.precision import float64
 
 # As one program each, as in a filter: to compile operations one by one takes longer.
@@ -314,7 +314,8 @@ def test_sums_of_exponentials(values):
 # Small matrices.
 
 
-@pytest.mark.parametrize("shape", [(50, 4, 4), *exactness([((24, 8, 8),)])])
+@pytest.mark.exactness
+@pytest.mark.parametrize("shape", [(50, 4, 4), (24, 8, 8)])
 def test_factors_of_many_small_matrices(shape):
     factors = np.tril(RNG.normal(size=shape) + 3 * np.eye(shape[1])).astype(np.float32)
     found = np.asarray(cholesky(jnp.asarray(factors @ np.swapaxes(factors, 1, 2))))
@@ -340,6 +341,7 @@ def test_cholesky_has_the_derivative_of_numpys():
         close(gradient(cholesky), gradient(jnp.linalg.cholesky), 1e-9)
 
 
+@pytest.mark.exactness
 def test_cholesky_judges_a_variance_beside_its_own_units():
     """A place in pixels beside a size in units of itself; a direction without variance."""
     units = np.array([30.0, 20.0, 0.02, 0.01])
@@ -419,6 +421,7 @@ def test_runs_of_a_vmap_choose_together():
     np.testing.assert_array_equal(slopes, jnp.where(needed, 2.0, 1.0))
 
 
+@pytest.mark.exactness
 def test_draws_that_are_made_once_are_the_same_and_stay_one_branch():
     """Of any type, with NaN, under `vmap` and in a gradient."""
 
@@ -435,6 +438,7 @@ def test_draws_that_are_made_once_are_the_same_and_stay_one_branch():
     np.testing.assert_allclose(jax.grad(scaled)(2.0), scaled(1.0), rtol=1e-6)
 
 
+@pytest.mark.exactness
 def test_rows_are_selected_whole_whatever_their_axes():
     chosen = np.array([True, False, True])
     new = {"number": jnp.arange(3.0), "matrix": jnp.asarray(RNG.normal(size=(3, 2, 4)))}

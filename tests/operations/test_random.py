@@ -129,6 +129,7 @@ class KeySpy(mpfjax.QuadraticModel):
 seen: list[str] = []
 
 
+@pytest.mark.exactness
 def test_a_model_is_handed_ordinary_keys():
     """Which all of `jax.random` takes; the library wraps a key where it draws."""
     filter = mpfjax.particle_filter(KeySpy(), 64)
@@ -137,6 +138,7 @@ def test_a_model_is_handed_ordinary_keys():
     assert set(seen) == {"threefry2x32"}
 
 
+@pytest.mark.exactness
 def test_splits_and_draws_are_those_of_ordinary_keys():
     same_keys(split(KEY, 5), jax.random.split(KEY, 5))
     np.testing.assert_array_equal(uniform(KEY, (7,)), jax.random.uniform(KEY, (7,)))

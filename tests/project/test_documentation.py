@@ -21,7 +21,8 @@ PAGES = [README, CONTRIBUTING, *sorted(DOCS.rglob("*.md"))]
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES if "notebooks" not in page.parts}
 WITH_CODE = [page for page in TEXTS if page != README and "```python" in TEXTS[page]]
 GALLERY = [page for page in WITH_CODE if page.parent.name == "gallery"]
-GUIDES = [page for page in WITH_CODE if page.parent.name != "gallery"]
+LONG = [page for page in WITH_CODE if page.stem in ("smoothing", "tuning")]
+GUIDES = [page for page in WITH_CODE if page.parent.name != "gallery" and page not in LONG]
 NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
 COMMAND = re.compile(r"python -m (benchmarks\.[a-z_]+|mpfjax\b)((?: [^\n`|#]*)?)")
 
@@ -35,7 +36,7 @@ def stem(page: Path) -> str:
 
 @pytest.mark.usefixtures("as_installed")
 @pytest.mark.parametrize(
-    "page", [README, *marked(pytest.mark.pages, GUIDES), *weekly(GALLERY)], ids=stem
+    "page", [README, *marked(pytest.mark.pages, GUIDES), *weekly([*LONG, *GALLERY])], ids=stem
 )
 def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     """All blocks of a page in their order, as a reader runs them: without the tests' strictness."""

@@ -6,6 +6,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
+
 import mpfjax
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,6 +35,7 @@ def test_requirements_have_lower_bounds_and_errors_name_extras():
     assert set(hints) <= known
 
 
+@pytest.mark.exactness
 def test_the_import_brings_what_a_first_filter_needs_and_the_rest_later():
     """In a new process, as a user's: without the tests' conftest."""
     code = (

@@ -24,7 +24,6 @@ from mpfjax.running.devices import choose_devices, over_threads
 from mpfjax.running.islands import IslandInteraction
 from tests import on_devices
 from tests.examples import make_mixture
-from tests.marking import exactness
 from tests.precision import float64
 from tests.unbiased import assert_unbiased
 from tests.user_models import TrickyQuadraticModel
@@ -139,6 +138,7 @@ EXCHANGING = exchanging(MODEL)
 
 
 class TestIslands:
+    @pytest.mark.exactness
     def test_evidence_and_means_are_unbiased(self):
         keys = jax.random.split(jax.random.key(3), 1500)
         run = jax.jit(jax.vmap(
@@ -220,6 +220,7 @@ class TestExchange:
         )
         return islands, jax.vmap(move, axis_name=DEVICE_AXIS)(islands)
 
+    @pytest.mark.exactness
     def test_deals_particle_i_to_island_i_and_keeps_every_one(self):
         before, after = self.exchanged(0.5, [0.0, -5.0, -20.0, -300.0])
         masses = np.exp(np.asarray(after.log_weights, float)).sum(axis=2)
@@ -272,6 +273,7 @@ class TestThreads:
         assert len(threads) == 2
         assert traced == [(3,)]
 
+    @pytest.mark.exactness
     def test_settings_and_transformations_of_this_thread_hold(self):
         keys = jax.random.split(jax.random.key(5), 4)
         with float64():
@@ -283,11 +285,12 @@ class TestThreads:
         np.testing.assert_allclose(jax.grad(total)(2.0), total(1.0), rtol=1e-5)
         np.testing.assert_allclose(jax.jit(total)(2.0), total(2.0), rtol=1e-5)
 
+    @pytest.mark.exactness
     @pytest.mark.parametrize(
         "limits",
         [
             {"_WORTH_A_THREAD": 1, "num_processors": lambda: 3},
-            *exactness([{"_IN_CACHE": 100, "_IN_NEAR_CACHE": 80}]),
+            {"_IN_CACHE": 100, "_IN_NEAR_CACHE": 80},
         ],
         ids=["on threads", "in groups"],
     )

@@ -37,6 +37,7 @@ def path(tmp_path):
     return tmp_path / "new" / "checkpoint.npz"
 
 
+@pytest.mark.exactness
 def test_an_online_filter_resumed_equals_the_uninterrupted_to_the_bit(path):
     """Its patience counts, so that what is resumed depends on the memory."""
     regroup = [mpfjax.Merge(max_deviations=4.0, patience=3), mpfjax.Split(), mpfjax.KMeans(2)]
@@ -114,6 +115,7 @@ class TestRoundTrip:
 
 
 class TestFiles:
+    @pytest.mark.exactness
     def test_a_file_that_is_cut_off_or_has_a_flipped_bit_loads_as_it_was_or_not_at_all(self, path):
         write_described(path, {"x": np.arange(3.0)}, {})
         stored = path.read_bytes()

@@ -16,7 +16,6 @@ import mpfjax
 from mpfjax import read_study, run_study
 from mpfjax.running import studies
 from tests.full_disk import no_room_beyond
-from tests.marking import exactness
 from tests.small_study import OBSERVATIONS, build, mean, measure, run_in_process, small_study
 from tests.user_models import TrickyQuadraticModel, nothing_traced
 
@@ -65,9 +64,8 @@ def breaking(error, after):
 
 
 class TestResults:
-    @pytest.mark.parametrize(
-        "options", [{"seeds_at_once": 3}, *exactness([{}, {"cells_at_once": 2}])]
-    )
+    @pytest.mark.exactness
+    @pytest.mark.parametrize("options", [{"seeds_at_once": 3}, {}, {"cells_at_once": 2}])
     def test_are_those_of_monte_carlo_for_each_cell(self, tmp_path, options):
         """In batches of three the four seeds keep their keys."""
         study = small_study(2, filters={"pf": build, "tricky": tricky})

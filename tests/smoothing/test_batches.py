@@ -12,7 +12,7 @@ def above(mixture):
     return mixture.average(mixture.particles > 0)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_a_batch_is_the_jackknife_of_ratios():
     filter = mixture_particle_filter(QuadraticModel(initial_draw="independent"), 100, 2)
     keys = jax.random.split(jax.random.key(0), 8)

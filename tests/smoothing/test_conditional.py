@@ -9,6 +9,7 @@ import mpfjax
 from mpfjax import Filter, KMeans, Merge, Propagate, RandomPartition, Resample, Split
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.smoothing import conditional_filter
+from tests.marking import quick_of
 from tests.smoothing.registry import MODELS, QUADRATIC
 from tests.smoothing.test_contracts import NUM_RUNS, exact_trajectories
 
@@ -59,7 +60,7 @@ def statistics(trajectories):
 
 
 @pytest.mark.exactness  # one by default is in `test_contracts.py`
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", quick_of(CASES, [], one_in=2))
 def test_exact_draws_stay_exact_and_much_is_new(name):
     """The mean change of every moment is zero, within four standard errors."""
     (filter, backward), before = CASES[name], exact_trajectories("two modes")

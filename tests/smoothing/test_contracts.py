@@ -106,7 +106,8 @@ def expected_rows(smoother, name, length):
     return np.array([exact_terms(name, s + 1)[r] for r, s in enumerate(settled)]), settled
 
 
-@pytest.mark.parametrize(("name", "chain", "model"), quick_of(CASES, QUICK_CASES, one_in=20))
+@pytest.mark.exactness
+@pytest.mark.parametrize(("name", "chain", "model"), quick_of(CASES, QUICK_CASES, one_in=40))
 def test_means_covariances_and_pairs_are_the_exact_ones(name, chain, model):
     """Times Ẑ/Z every estimate is unbiased: within four standard errors."""
     smoother = SMOOTHERS[name]
@@ -128,7 +129,7 @@ ODD = {"nothing seen": [np.nan] * 3, "zero likelihood": [1.0, 1e30, np.nan], "on
 ONLINE = [name for name, smoother in SMOOTHERS.items() if smoother.online]
 
 
-@pytest.mark.parametrize("odd", quick_of(ODD, ["zero likelihood"]))
+@pytest.mark.parametrize("odd", quick_of(ODD, ["zero likelihood"], one_in=2))
 @pytest.mark.parametrize("name", quick_of(["of a run", *ONLINE], ["of a run"]))
 def test_rows_are_finite(name, odd):
     model, _ = MODELS["two modes"]
@@ -148,6 +149,7 @@ def test_rows_are_finite(name, odd):
     assert np.isinf(increments).any() == (1e30 in observations)
 
 
+@pytest.mark.exactness
 def test_statistics_are_those_that_are_expected():
     """Of trajectories drawn from the exact distribution, so that the truth is not of one kind."""
     for name, (model, observations) in MODELS.items():

@@ -22,7 +22,7 @@ def observe(key, states):
     return states + np.sqrt(0.4) * jax.random.normal(key, states.shape)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_moments_are_the_kalman_filters_and_components_keep_their_masses():
     filter = mpfjax.mixture_particle_filter(LINEAR, 100, 3)
 
@@ -67,6 +67,7 @@ def test_a_wrapped_models_observations_are_drawn_one_by_one():
     np.testing.assert_allclose(noise.std(axis=1), 1.0, atol=4 / np.sqrt(2 * 400))
 
 
+@pytest.mark.exactness
 def test_intervals_are_the_kalman_filters():
     """Of states and observations, where weights are far from equal after a surprising y_t."""
     seen = SEEN.at[-1].set(1.5)

@@ -10,6 +10,7 @@ import mpfjax
 from mpfjax import Filter, PropagateRegimes
 from mpfjax.exact import switching_filter
 from mpfjax.smoothing import sample_trajectories
+from tests.marking import quick_of
 from tests.moves import test_marginalised_mixed as tests_mixed
 from tests.moves.test_marginalised_mixed import Mixed, whole
 from tests.smoothing import exact_smoothers
@@ -60,7 +61,7 @@ CASES = {
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", quick_of(CASES, ["R singular"], one_in=3))
 def test_regimes_and_moments_are_those_of_all_sequences(case):
     model, observations, centre = CASES[case]
     filter = Filter(model, [PropagateRegimes()], 200)

@@ -8,6 +8,7 @@ import mpfjax
 from mpfjax.operations.random import split
 from mpfjax.smoothing import FixedLagSmoother, smoothed_sums
 from mpfjax.smoothing.sums import _advanced
+from tests.marking import weekly
 from tests.smoothing.test_trajectories import QUADRATIC, SQUARES
 
 
@@ -24,7 +25,8 @@ def test_no_lag_is_filtering_and_counts_are_averaged():
     np.testing.assert_array_equal(found.run.final.particles, run.final.particles)
 
 
-@pytest.mark.parametrize("method", ["exact", "mcmc"])
+@pytest.mark.exactness
+@pytest.mark.parametrize("method", ["exact", *weekly(["mcmc"])])
 def test_one_step_at_a_time_is_the_whole_series(method):
     """From the same start by the same keys: the term at t - L, and at the end those left."""
     lag, key, terms, spreads = 2, jax.random.key(3), [], []
@@ -53,7 +55,8 @@ def test_one_step_at_a_time_is_the_whole_series(method):
     np.testing.assert_allclose(whole.variances["up"], chances * (1 - chances), atol=1e-5)
 
 
-@pytest.mark.parametrize("method", ["exact", "mcmc"])
+@pytest.mark.exactness
+@pytest.mark.parametrize("method", ["exact", *weekly(["mcmc"])])
 def test_variances_are_about_the_mean_however_far_from_zero(method):
     """As those of a Kalman smoother, where E[x²] - E[x]² is rounding alone."""
     noise = np.random.default_rng(0).normal(size=(2, 12))

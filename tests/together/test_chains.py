@@ -107,6 +107,7 @@ def runs(chain, model="quadratic", slots=None):
     return jax.tree.map(np.asarray, run)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(("chain", "model", "slots"), EXACT)
 def test_evidence_and_moments_are_unbiased(chain, model, slots):
     """E[Ẑ/Z] = 1, and E[Ẑ/Z φ̂] = E[φ | y], at every step, within 4 standard errors.
@@ -143,6 +144,7 @@ def test_what_is_approximate_is_declared():
 class TestOnline:
     """The chain's single step, on the tricky quadratic model."""
 
+    @pytest.mark.exactness
     def test_step_by_step_equals_the_scan_and_a_loop_equals_vmap(self, chain):
         run, filter = runs(chain), chain_filter(chain, "quadratic")
         k = 6  # in which no particle lies within rounding of the edge between two offspring
@@ -230,6 +232,7 @@ def started(chain):
     return filter.step(jax.random.key(5), mixture, OBSERVATIONS[0])[0]
 
 
+@pytest.mark.exactness
 def test_a_missing_observation_moves_the_particles_and_leaves_the_masses():
     filter, mixture = chain_filter("mpf", "quadratic"), started("mpf")
     predicted, info = filter.predict(jax.random.key(6), mixture)

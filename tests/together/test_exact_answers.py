@@ -43,6 +43,7 @@ def test_a_step_weighs_by_the_likelihood_times_the_dynamics_over_the_proposal(mo
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("move", [mpfjax.RandomWalkMetropolis, mpfjax.MetropolisAdjustedLangevin])
 def test_many_metropolis_steps_leave_the_target_as_it_is(move):
     """Of exact draws from p(x_1 | x_0, y_1): mean and variance, with a likelihood that is narrow.
@@ -69,6 +70,7 @@ def test_many_metropolis_steps_leave_the_target_as_it_is(move):
     assert abs((residuals**3).mean()) < 4 * np.sqrt(15 / n)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("dead", [None, 1])
 def test_prior_masses_of_dps_are_those_of_the_living_and_the_total_is_the_evidence(dead):
     """Each living component's share is that of before among the living (section 4)."""
@@ -109,6 +111,7 @@ def test_slots_are_asked_for_by_mass_times_the_root_of_the_variance():
     np.testing.assert_allclose(asked / asked.sum(), expected, rtol=0.01)
 
 
+@pytest.mark.exactness
 def test_the_total_of_islands_is_the_mean_over_all_their_particles():
     """Of one step without resampling, from the likelihoods of the particles themselves."""
     filter = mpfjax.Filter(MODEL, [Propagate()], 12)
@@ -143,6 +146,7 @@ def sample_standard_normal(key):
     return {"mean": jax.random.normal(key)}
 
 
+@pytest.mark.exactness
 def test_evidence_of_smc2_is_the_exact_one_where_every_filter_is_exact():
     """Of y ~ N(θ, 1), θ ~ N(0, 1): log N(y; 0, I + 1 1ᵀ) without its constant, over ten runs."""
     observations = jnp.array([2.0, 1.4, 2.6, 1.8])
@@ -164,6 +168,7 @@ def test_evidence_of_smc2_is_the_exact_one_where_every_filter_is_exact():
     assert_unbiased([run.mean("mean") for run in runs], y.sum() / 5)
 
 
+@pytest.mark.exactness
 def test_chains_accept_by_a_number_of_its_own():
     """Where every filter is exact, the posterior N(Σy / (t + 1), 1 / (t + 1)) and nothing else.
 

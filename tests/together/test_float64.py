@@ -38,6 +38,7 @@ def assert_double(tree):
     assert {leaf.dtype for leaf in floats} == {np.dtype("float64")}
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(
     "chain", quick_of([*QUICK_CHAINS, "guided mpf", "partitioned in clusters"], ["guided mpf"])
 )
@@ -96,6 +97,7 @@ class OfSingle(mpfjax.AbstractStateSpaceModel):
         return -0.5 * z**2 - jnp.log(self.deviation * jnp.sqrt(2 * jnp.pi))
 
 
+@pytest.mark.exactness
 def test_states_in_float32_stay_so_beside_a_python_float():
     """As they do in JAX; and Ẑ is that of the Kalman filter."""
     seen, one = jnp.array([0.4, -0.2, 0.7]), jnp.ones((1, 1))

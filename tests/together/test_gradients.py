@@ -95,7 +95,8 @@ def deviations(name, transform):
     return found
 
 
-@pytest.mark.parametrize("name", quick_of(FILTERS, ["pf"], one_in=4))
+@pytest.mark.exactness
+@pytest.mark.parametrize("name", quick_of(FILTERS, ["pf", "mpf"], one_in=8))
 def test_stop_gradient_scores_are_unbiased(name):
     """∇Ẑ = Ẑ ∇log Ẑ is an unbiased estimate of ∇Z, for any number of particles."""
     found = deviations(name, (lambda f: f) if name == "pathwise" else with_score_gradient)

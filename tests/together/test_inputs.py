@@ -18,7 +18,7 @@ import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
 from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.smoothing import sample_trajectories, smoothed_sums
-from tests.marking import exactness, quick_of
+from tests.marking import quick_of
 from tests.unbiased import assert_unbiased, ratios_to
 
 TIMES = np.cumsum([0.3, 1.7, 0.2, 0.2, 2.5, 0.6]).astype(np.float32)
@@ -139,6 +139,7 @@ def nothing(mixture):
     return None
 
 
+@pytest.mark.exactness
 def test_the_references_take_controls_and_matrices_by_time():
     model, inputs = in_matrices()
     log_z, filtered, smoothed = truth()
@@ -152,6 +153,7 @@ def test_the_references_take_controls_and_matrices_by_time():
     np.testing.assert_allclose(run.means, filtered, atol=1e-4)
 
 
+@pytest.mark.exactness
 def test_evidence_and_means_are_unbiased():
     """E[Ẑ/Z] = 1 and E[Ẑ/Z E^[x_t]] = E[x_t | y_1..y_t], within 4 standard errors."""
     filter, keys = mpfjax.particle_filter(Driven(), 48), jax.random.split(KEY, 2000)
@@ -162,7 +164,8 @@ def test_evidence_and_means_are_unbiased():
     assert_unbiased(ratios * run.collected[:, -1], filtered[-1])
 
 
-@pytest.mark.parametrize("method", ["trajectories", *exactness(["sums"])])
+@pytest.mark.exactness
+@pytest.mark.parametrize("method", ["trajectories", "sums"])
 def test_smoothed_means_are_those_of_the_joint_normal(method):
     """Of every time, within 4 standard errors over the runs."""
     filter, given = mpfjax.particle_filter(Driven(), 200), jax.tree.map(jnp.asarray, INPUTS)
@@ -236,6 +239,7 @@ EVERYWHERE = {
 QUICK = ["a proposal"]
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("name", quick_of(EVERYWHERE, QUICK, one_in=2))
 def test_every_move_sees_the_inputs(name):
     """Inputs give the step of the model with them built in, and other inputs another one."""
@@ -288,6 +292,7 @@ def run(filter=FILTER, observations=OBSERVATIONS, collect=mean, inputs=INPUTS, *
     return mpfjax.run_filter(KEY, filter, observations, collect, inputs=inputs, **options)
 
 
+@pytest.mark.exactness
 def test_an_input_of_a_step_that_is_nan_or_not_there_is_an_error():
     with pytest.raises(RuntimeError, match="inputs: NaN or infinite"):
         FILTER.step(KEY, FILTER.init(KEY), OBSERVATIONS[0], inputs=built_in(u=np.nan))
@@ -297,6 +302,7 @@ def test_an_input_of_a_step_that_is_nan_or_not_there_is_an_error():
     assert "its inputs None, as the call gives no u_t" in str(caught.value)
 
 
+@pytest.mark.exactness
 def test_a_missing_observation_does_not_miss_its_input():
     found = run(observations=OBSERVATIONS.at[-1].set(jnp.nan), missing="skip", collect=None)
     before = jax.tree.map(lambda leaf: leaf[-2], found.collected)
@@ -329,6 +335,7 @@ def test_monte_carlo_islands_and_studies_hand_them_on(tmp_path):
     np.testing.assert_allclose(*found, rtol=1e-5)
 
 
+@pytest.mark.exactness
 def test_a_model_of_one_particle():
     found = run(filter=mpfjax.particle_filter(mpfjax.per_particle(DrivenOfOne()), 2000))
     np.testing.assert_allclose(found.collected, truth()[1], atol=0.1)

@@ -115,6 +115,7 @@ TAKEN = {
 }  # fmt: skip
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("name", TAKEN)
 def test_what_takes_numbers_takes_small_whole_ones_and_other_bytes(name):
     function, numbers = TAKEN[name]

@@ -216,6 +216,7 @@ def refusals(function):
                 yield name, value
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("function", GOOD | WITH_BOXES, ids=lambda function: function.__name__)
 def test_what_an_annotation_rules_out_is_refused_by_name(function):
     good = (GOOD | WITH_BOXES)[function]
@@ -277,6 +278,7 @@ def calls(draw, functions):
     return function, GOOD[function] | {name: draw(values) for name in changed}, changed
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(
     ("functions", "number"), [(BUILDERS, 500), (RUNNERS, 60), *weekly([(BUILDERS, 5_000)])]
 )
@@ -522,6 +524,7 @@ REFUSED = (
 )  # fmt: skip
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(("words", "call"), REFUSED, ids=[words[:40] for words, _ in REFUSED])
 def test_what_is_refused_for_another_reason(words, call):
     with pytest.raises(ValueError, match=words):
@@ -653,6 +656,7 @@ def test_arrays_become_those_of_jax():
             checks.to_array("size")(value)
 
 
+@pytest.mark.exactness
 def test_traced_values_pass():
     @checks.checked
     def call(size: Annotated[jax.Array, checks.POSITIVE]):

@@ -119,6 +119,7 @@ def assert_same_draws(one, other):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.exactness
 def test_interrupted_anywhere_the_draws_are_those_of_one_run(tmp_path, monkeypatch):
     """In the burn-in, where nothing is lost, and after it, where the draws so far come back."""
     whole, kept = blind(30, **WHOLE), WHOLE | {"checkpoint": Checkpoint(tmp_path / "c.npz", 4)}

@@ -59,6 +59,7 @@ def test_each_label_has_its_own_candidates():
             assert found[t, k] <= np.log(6) + 1e-5
 
 
+@pytest.mark.exactness
 def test_of_a_conditionally_linear_model_labels_carry_moments():
     """A known x has no variance: L is then N(y; H x + c, R) of the regime, in numpy."""
     model, y = switching.MODEL, switching.OBSERVATIONS[:2]
@@ -82,6 +83,7 @@ def test_of_a_conditionally_linear_model_labels_carry_moments():
     np.testing.assert_allclose(rivals.covariance[0, 0], Q[z], atol=1e-6)
 
 
+@pytest.mark.exactness
 def test_the_scale_has_a_best_value_and_a_factor_of_y_none():
     observations, labels, rivals = data(400, 60)
     objective = LabelLikelihood(observations, labels[1:], rivals)

@@ -38,7 +38,7 @@ class Counted(ScalarLinear):
         return super().log_likelihood(observation, states)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_likelihoods_are_those_of_the_states_and_calls_share_a_program():
     """They change when, and only when, a step moves; of any length, burn-in and thinning."""
     filter = mpfjax.particle_filter(Counted(), 12)

@@ -52,7 +52,7 @@ def series_of(length, rng):
     return jnp.array(rows)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_the_maximum_is_found_with_its_standard_errors():
     """On a linear-Gaussian model, whose likelihood the Kalman filter gives."""
     rng = np.random.default_rng(0)
@@ -94,6 +94,7 @@ def newton(function, x):
     return x - jnp.linalg.solve(jax.hessian(function)(x), jax.grad(function)(x))
 
 
+@pytest.mark.exactness
 def test_away_from_a_maximum_there_are_no_standard_errors():
     with pytest.warns(UserWarning, match="no maximum here"):
         none = standard_errors(
@@ -103,6 +104,7 @@ def test_away_from_a_maximum_there_are_no_standard_errors():
 
 
 class TestResuming:
+    @pytest.mark.exactness
     @pytest.mark.parametrize(
         ("other", "named"),
         [
@@ -195,6 +197,7 @@ class Plain(ScalarLinear):
     q: float = eqx.field(static=True, default=0.6)
 
 
+@pytest.mark.exactness
 def test_python_floats_are_tuned_like_arrays_where_they_are_named():
     def history(model):
         filter = mpfjax.particle_filter(model, 16, gradient="stop")
@@ -231,6 +234,7 @@ class TestBias:
         with pytest.warns(UserWarning, match="fit: PropagateNested has no gradient"):
             self.warn(mpfjax.Filter(ScalarLinear(), moves, 16))
 
+    @pytest.mark.exactness
     def test_what_is_right_is_not(self):
         with warnings.catch_warnings(action="error"):
             self.warn(mpfjax.particle_filter(ScalarLinear(), 16, gradient="stop"))

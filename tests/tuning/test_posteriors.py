@@ -79,6 +79,7 @@ def by_gibbs_through_a_mixture():
     return np.log(run.parameters["sigma_y"]), posterior_of_log_sigma()
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(
     "sample",
     [
@@ -101,7 +102,7 @@ class NoTransition(Pushed):
     log_transition = None
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_without_log_transition_the_trajectory_follows_its_ancestors():
     filter = mpfjax.particle_filter(NoTransition(), 10)
     run = particle_gibbs(KEY, filter, SERIES, 3, draw=draw_a, num_chains=2, **OF_A)

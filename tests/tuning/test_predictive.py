@@ -120,6 +120,7 @@ def z_scores(values, mean, variance, independent=None):
     return moments.mean(axis=(1, 2)) / error[:, 0]
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("sample", [by_metropolis, *weekly([by_gibbs, by_smc2])])
 def test_means_and_variances_are_the_exact_ones(sample):
     """Within four standard errors, over chains; of `smc2`, by its effective sample size."""
@@ -155,7 +156,7 @@ class Steps(mpfjax.AbstractStateSpaceModel):
         return states[:, 1] + 0.5 * jax.random.normal(key, states[:, 1].shape)
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_what_is_seen_of_a_step_is_a_number_of_the_state():
     """Places and steps, by the genealogy, beside the Kalman smoother of (x_t, x_{t-1}, d)."""
     seen = np.float32([1.2, 0.3, 0.8])

@@ -36,6 +36,7 @@ def with_thresholds(monkeypatch, ess=0.5, acceptance=0.2):
     monkeypatch.setattr(observing, "_ACCEPTANCE_THRESHOLD", acceptance)
 
 
+@pytest.mark.exactness
 def test_one_step_and_no_observation_at_all():
     """Without observations the samples are those of the prior."""
     run = sample(observations=Series.skipping(jnp.full(1, jnp.nan)))

@@ -163,6 +163,7 @@ def test_what_has_not_the_size_or_shape_of_a_person_is_dropped():
     np.testing.assert_allclose(lenient, [(10, 10, 2, 3), (20, 100, 70, 4), (100, 20, 4, 70)])
 
 
+@pytest.mark.exactness
 @pytest.mark.real_data
 def test_people_on_a_real_street_are_found(data):
     """Frames 1 to 120, with people from the first on, pairs, and an unlabelled walker."""

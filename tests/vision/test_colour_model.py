@@ -107,6 +107,7 @@ def test_x0_scatters_equally_about_all_references(frame):
         np.testing.assert_allclose(boxes.std(axis=0), DEVIATIONS, rtol=0.1)
 
 
+@pytest.mark.exactness
 def test_the_transition_draws_from_its_own_density(frame):
     """E[p(x) / p(x)] aside, the mean log density is minus the entropy of the Gaussian."""
     model = model_of(frame)
@@ -120,6 +121,7 @@ def test_the_transition_draws_from_its_own_density(frame):
     assert (model.log_transition(other, before) == -jnp.inf).all()
 
 
+@pytest.mark.exactness
 def test_references_switch_as_often_as_they_should(frame):
     model = model_of(frame, switch_probability=0.3)
     before = BoxState(jnp.ones((20000, 4)), jnp.zeros(20000, jnp.int32))
@@ -135,6 +137,7 @@ def test_references_switch_as_often_as_they_should(frame):
     assert stayed / switched == pytest.approx(0.85 / 0.15, rel=1e-4)
 
 
+@pytest.mark.exactness
 def test_dynamics_with_a_velocity_carry_it_along(frame):
     walk = RandomWalk(jnp.asarray(DEVIATIONS))
     model = model_of(frame, dynamics=WalkWithVelocity(walk, 0.5, jnp.asarray([3.0, 1, 0, 0])))

@@ -27,6 +27,7 @@ def test_hue_saturation_and_value_are_matplotlibs(frame):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
+@pytest.mark.exactness
 def test_hsv_counts_by_colour_or_by_value(frame):
     """N_h N_s + N_v bins in one histogram, filled by a loop over the pixels."""
     colours = HSVColours(

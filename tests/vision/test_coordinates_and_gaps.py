@@ -58,6 +58,7 @@ def test_who_leaves_a_frame_of_known_size_ends_and_who_enters_there_is_another()
     assert living(tracks[-1]) == [2]
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("every", [2, 14, 25])
 def test_a_motionless_object_that_is_rarely_detected_is_one_object(every):
     boxes = [(100, 100, 10, 20) if t % every == 0 else None for t in range(6 * every + 1)]
@@ -68,6 +69,7 @@ def test_a_motionless_object_that_is_rarely_detected_is_one_object(every):
 # --- coordinates ---------------------------------------------------------------------------
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("origin", [(-5e6, 3e5), (4e8, 2e9)])
 @pytest.mark.parametrize("form", ["rows", "iterable"])
 def test_the_origin_of_the_coordinates_changes_nothing(origin, form):

@@ -6,6 +6,7 @@ import pytest
 
 from mpfjax.vision.boxes.following import Snapshot, annotate, follow, track_rows
 from mpfjax.vision.boxes.recipes import PRESETS
+from tests.marking import weekly
 
 
 def snapshots(references=True):
@@ -55,7 +56,7 @@ def test_a_crop_counts_as_slices_do():
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize("name", ["default", "paper"])
+@pytest.mark.parametrize("name", ["default", *weekly(["paper"])])
 def test_the_recipes_keep_to_objects_that_stand_still(name):
     """A red and a blue box on grey: a component is on each, and in all three frames."""
     still, boxes = (

@@ -46,6 +46,7 @@ def random_boxes(num):
     return (np.round(boxes * 8) / 8).astype(np.float32)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(("num_bins", "num_parts"), [(30, 1), (16, 1), (7, 2), (256, 1)])
 @pytest.mark.parametrize("wide_counts", [False, True])
 @pytest.mark.parametrize("soon", [False, True])

@@ -42,6 +42,7 @@ def centres(boxes=BOXES):
     return boxes[:, :2] + boxes[:, 2:] / 2
 
 
+@pytest.mark.exactness
 def test_the_likelihood_is_the_papers_formula(frame):
     """Σ_j -λ Σ_parts (1 - Σ_b sqrt(h r)), from numpy's histograms of red, green and blue."""
     model = joint_colour_model(frame, BOXES, lambda_=7.0, colours=RGBColours(8), num_parts=2)
@@ -65,6 +66,7 @@ def test_the_likelihood_is_the_papers_formula(frame):
     np.testing.assert_allclose(other, 3 * value, rtol=1e-5)
 
 
+@pytest.mark.exactness
 def test_dynamics_are_the_papers(model):
     """x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t, of each object on its own."""
     states = model.sample_initial(KEY, 4000)

@@ -58,6 +58,7 @@ def grown(box, across, down=1.0):
     return np.array([x - (across - 1) * w / 2, y - (down - 1) * h / 2, across * w, down * h])
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("pixels", SIZES)
 @pytest.mark.parametrize("wide_counts", [False, True])
 def test_a_count_that_cannot_be_made_is_no_zero(frame, pixels, wide_counts):
@@ -103,6 +104,7 @@ def test_the_likelihood_with_contrast_is_numpys(frame, pixels):
     np.testing.assert_allclose(found, expected, rtol=1e-3)
 
 
+@pytest.mark.exactness
 def test_growing_beyond_all_counts_is_not_rewarded(frame):
     """On one colour throughout, where no size speaks for itself."""
     plain = np.full_like(frame, 100)

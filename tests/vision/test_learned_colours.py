@@ -56,6 +56,7 @@ def by_hand(anchor, hidden, rate):
     return np.log(seen + unseen), appearance + share * (now - appearance)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize(("anchor", "hidden", "rate"), [(0.3, 0.4, 0.5), (0.0, 1.0, 1.0)])
 def test_the_likelihood_and_what_is_learned_by_hand(anchor, hidden, rate):
     inner = colour_model()

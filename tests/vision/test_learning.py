@@ -86,6 +86,7 @@ def test_the_detectors_errors_are_learned_in_a_second(error):
     assert (np.asarray(noises.velocity) < 0.01).all()  # nothing but the detector errs
 
 
+@pytest.mark.exactness
 def test_who_moves_at_random_is_not_taken_for_a_bad_detector():
     rng = np.random.default_rng(0)
     walk = np.cumsum(np.cumsum(rng.normal(0, 0.03, (50, M, 2)), axis=0), axis=0) * [50, 120]
@@ -97,6 +98,7 @@ def test_who_moves_at_random_is_not_taken_for_a_bad_detector():
     assert (np.asarray(noises.velocity)[2:] < 0.006).all()
 
 
+@pytest.mark.exactness
 def test_at_a_low_rate_a_velocity_may_change_by_a_third_of_a_box():
     """Which no candidate for 25 frames a second has."""
     turns = np.random.default_rng(0).normal(0, 0.35, (50, M, 2))

@@ -186,6 +186,7 @@ def test_an_object_without_detections_moves_with_the_picture():
     assert distances(detections[-1], boxes[-1]).min() > 6
 
 
+@pytest.mark.exactness
 def test_wrong_motions_from_pixels_are_overruled_by_the_detections():
     """Jumps of 5 pixels, which the camera did not make, are taken out again."""
     boxes = shaken(1)[1][0]

@@ -105,12 +105,14 @@ def right_after_a_meeting(crosses, with_vectors, seed):
     return kept[20] == kept[-1]
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("with_vectors", [*weekly([False]), True])
 def test_look_alikes_in_motion_are_told_apart_by_their_vectors(with_vectors):
     kept = [right_after_a_meeting(way, with_vectors, seed) for way in (0, 1) for seed in range(4)]
     assert all(kept) == with_vectors
 
 
+@pytest.mark.exactness
 def test_an_identity_is_regained_after_a_long_cover():
     """Walkers behind a wall for three seconds, by their motion; 5% of speed changes at random."""
     rng = np.random.default_rng(3)

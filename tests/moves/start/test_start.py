@@ -49,6 +49,7 @@ def test_evidence_and_moments_are_unbiased_beyond_the_window():
     assert_unbiased(ratios[:, None] * np.asarray(runs.collected)[:, -1], exact.means[-1])
 
 
+@pytest.mark.exactness
 def test_one_step_at_a_time_is_a_run():
     run = mpfjax.run_filter(KEY, FILTER, SEEN, mean)
     key_start, key_steps = jax.random.split(KEY)
@@ -60,6 +61,7 @@ def test_one_step_at_a_time_is_a_run():
         assert (np.asarray(mixture.ancestor_indices) == -1).all() == (t < LENGTH)
 
 
+@pytest.mark.weekly
 def test_fewer_observations_than_the_window_has():
     run = mpfjax.run_filter(KEY, FILTER, SEEN, mean)
     short = mpfjax.run_filter(KEY, FILTER, SEEN[: LENGTH - 1], mean)
@@ -158,11 +160,13 @@ def test_a_start_and_restarts_are_one_whichever_comes_first():
     assert sum(isinstance(move, Start) for move in both[0].moves) == 1
 
 
+@pytest.mark.exactness
 def test_without_y_1_x_0_are_plain_draws():
     mixture, _ = FILTER.step(KEY, FILTER.init(KEY), SEEN[0])
     assert (np.asarray(mixture.ancestor_indices) >= 0).all()
 
 
+@pytest.mark.exactness
 def test_what_cannot_begin_so_is_refused():
     with pytest.raises(ValueError, match="needs every slot"):
         mpfjax.monte_carlo(jax.random.split(KEY, 2), FILTER, SEEN, mean, slots=120)

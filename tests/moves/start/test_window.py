@@ -15,7 +15,6 @@ from mpfjax.moves.start.window import (
     observe,
     with_derivatives,
 )
-from tests.marking import weekly
 from tests.unbiased import assert_unbiased
 
 KEY = jax.random.key(0)
@@ -77,8 +76,8 @@ class WithKeys(mpfjax.AbstractStateSpaceModel):
         return jnp.sum(jax.scipy.stats.norm.logpdf(observation[None], states, 0.3), axis=1)
 
 
-@pytest.mark.parametrize("model", [WithKeys(), *weekly([PLANE])], ids=["keys", "noise"])
-@pytest.mark.exactness
+@pytest.mark.parametrize("model", [WithKeys(), PLANE], ids=["keys", "noise"])
+@pytest.mark.weekly
 def test_evidence_and_moments_are_unbiased(model):
     """The third observation is missing."""
     states, log_z = starts(model, window_of(PLACES, PRESENT), 100, 300)
@@ -102,6 +101,7 @@ class Edged(WithKeys):
         return jnp.where(jnp.abs(states - observation) < 0.5, 0.0, -jnp.inf)
 
 
+@pytest.mark.exactness
 def test_hard_edges_leave_the_evidence_unbiased():
     """Beside sums over a grid; 60 draws and a pilot of 12 meet y_1 by one or two."""
     places = np.array([12.0, 12.3, 11.8, 11.7], np.float32)
@@ -114,6 +114,7 @@ def test_hard_edges_leave_the_evidence_unbiased():
     assert_unbiased(np.exp(log_z) / law.sum(), loosest=0.04, errors=3.0)
 
 
+@pytest.mark.exactness
 def test_a_start_without_any_likelihood_says_so():
     _, log_z = starts(Edged(), window_of([30.0, 30.0]), 40, 2)
     assert (log_z == -np.inf).all()
@@ -136,6 +137,7 @@ class Rooms(WithKeys):
         return -0.5 * jnp.sum((gaps / 0.01) ** 2, axis=1)
 
 
+@pytest.mark.exactness
 def test_equal_modes_have_equal_masses():
     """A mode is a thousandth of its room, so that none of the paths may hit it at first."""
     places = np.array([[0.3, 0.6]] * 4) + np.array([[0.01, -0.01], [0, 0], [0.005, 0], [0, -0.01]])
@@ -154,7 +156,7 @@ def test_a_model_whose_x_0_cannot_be_moved_is_refused():
         check_start(OnlyDraws(), "a start needs it")
 
 
-@pytest.mark.exactness
+@pytest.mark.weekly
 def test_the_paths_have_the_score_of_what_was_observed():
     """Fisher's identity, beside the derivative of the Kalman filter's log-likelihood."""
     window = window_of(PLACES, PRESENT)
