@@ -122,6 +122,7 @@ def test_evidence_and_means_are_unbiased_at_every_step_and_the_noise_is_less(nam
     assert found[:, -1].std() < case.share * plain[:, -1].std() * within
 
 
+@pytest.mark.exactness
 def test_a_look_ahead_that_is_wrong_is_exact_all_the_same():
     """ψ of other observations: the weights undo it, however bad it is."""
     other = 0.8 * SQUARES[:4]

@@ -221,6 +221,7 @@ def test_an_alarm_is_given_where_all_hypotheses_are_wrong(name, told):
     assert not silence
 
 
+@pytest.mark.exactness
 def test_after_a_restart_the_state_is_found_and_the_alarm_ends(told):
     run, _ = told["restarts", True]
     np.testing.assert_allclose(jax.vmap(lambda m: m.mean())(run.final), 11.0, atol=0.5)
