@@ -4,7 +4,6 @@ The index of x_s given x_{s+1} has the probabilities W_s^i D(x_{s+1} | x_s^i), w
 joint weights of the mixture at s. Component indicators do not enter, since the weights are joint.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -18,16 +17,7 @@ from mpfjax.models.base import with_inputs
 from mpfjax.models.steps import log_transition
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
-from mpfjax.operations.prefix_sums import (
-    exact_sum_before,
-    growths,
-    in_slots,
-    last_before,
-    needs_two_parts,
-    random_positions,
-    scales,
-    sum_before,
-)
+from mpfjax.operations.prefix_sums import needs_units, sum_before, to_units, unit_bits
 from mpfjax.operations.random import split, uniform
 from mpfjax.operations.stored import take
 
@@ -42,13 +32,11 @@ def draw(
     """Indices by their weights, by the inverse of the cumulative weights."""
     n, dtype = log_weights.shape[0], log_weights.dtype
     weights = exp(log_weights - finite_or_zero(jnp.max(log_weights)))
-    if needs_two_parts(n, dtype):
-        length = jnp.full(1, n, jnp.int32)
-        scale = scales(jnp.sum(weights, keepdims=True), length, n)
-        before, total = exact_sum_before(weights * scale)
-        before = in_slots(before, growths(total, length), jnp.zeros(1, jnp.int32))
-        points = random_positions(key, jnp.full(math.prod(shape), n, jnp.int32))
-        indices = last_before(before, points, n).reshape(shape)
+    if needs_units(n, dtype):
+        units = to_units(weights * (n / jnp.sum(weights)), unit_bits(n))
+        upto = jnp.cumsum(units, dtype=jnp.int32)
+        target = jax.random.randint(key, shape, 0, upto[-1], jnp.int32)
+        indices = jnp.searchsorted(upto, target, side="right").astype(jnp.int32)
     else:
         before, total = sum_before(weights)
         target = uniform(key, shape, dtype) * total
@@ -115,7 +103,7 @@ def draw_exactly(
 
     number = jax.tree.leaves(futures)[0].shape[0]
     dtype = mixture.log_weights.dtype
-    keys = split(key, 2) if needs_two_parts(n, dtype) else [key]
+    keys = split(key, 2) if needs_units(n, dtype) else [key]
     quantiles = [uniform(key, (number, num_draws), dtype) for key in keys]
     together = max(1, min(number, MOST_DENSITIES // (cost * n)))
     inputs = (jnp.stack(quantiles, axis=1), futures)

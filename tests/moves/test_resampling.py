@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mpfjax import Resample
-from mpfjax.moves.resampling.allocation import EQUAL_PARTS, FEWEST, place_slots
-from mpfjax.moves.resampling.ancestors import SCHEMES, random_points
+from mpfjax.moves.resampling.allocation import EQUAL_PARTS, FEWEST
+from mpfjax.moves.resampling.ancestors import SCHEMES
 from mpfjax.operations import prefix_sums
 from tests.examples import make_mixture
 from tests.marking import quick_of
@@ -82,7 +82,7 @@ def test_no_particle_of_zero_weight_is_ever_fed(scheme, n, most, monkeypatch):
     """Not with random draws, nor with uniform draws at their ends; nor is mass moved.
 
     Float32 has no room for a hundred thousand exact cumulative weights: guards must hold, those of
-    sums in two parts too, which few particles take here.
+    sums of units too, which few particles take here.
     """
     if most is not None:
         monkeypatch.setattr(prefix_sums, "MOST_IN_ONE_FLOAT", most)
@@ -136,23 +136,6 @@ def test_means_of_many_particles_stay_where_they_are(scheme, kind, m):
         found.append(sums(offspring * states) / sums(offspring) - exact)
     # What rounding of a weight may do to a mean.
     assert_unbiased(found, 0.0, slack=4e-7)
-
-
-@pytest.mark.exactness
-def test_points_stay_within_their_components_stretch_of_slots(monkeypatch):
-    """The largest uniform numbers round up onto the border, which is the next component's."""
-    targets = jnp.asarray([1, 25_000, 2**20, 74_999], jnp.int32)
-    slots = place_slots(targets, 2**20 + 100_000)
-    ends = np.asarray(slots.firsts) + np.asarray(targets)
-    monkeypatch.setattr(
-        prefix_sums, "bits", lambda key, shape: jnp.full(shape, 2**32 - 1, jnp.uint32)
-    )
-    monkeypatch.setattr(prefix_sums, "uniform", lambda key, shape: jnp.full(shape, NEARLY_ONE))
-    points = jax.jit(lambda key: random_points(key, slots, targets))(KEY)
-    own = np.asarray(slots.components)
-    assert (points.whole >= np.asarray(slots.firsts)[own]).all()
-    assert (points.whole < ends[own]).all()
-    assert ((points.fraction >= 0) & (points.fraction < 1)).all()
 
 
 @pytest.mark.exactness

@@ -19,7 +19,14 @@ from mpfjax.operations.matrices import (
     solve_lower,
     transformed,
 )
-from mpfjax.operations.prefix_sums import count_starts, count_upto, few_upto, sum_before
+from mpfjax.operations.prefix_sums import (
+    count_starts,
+    count_upto,
+    few_upto,
+    sum_before,
+    to_units,
+    unit_bits,
+)
 from mpfjax.operations.rows import select_rows
 from mpfjax.operations.segments import (
     segment_any,
@@ -96,47 +103,18 @@ def test_sums_before_in_float64():
         close(np.append(before, total), np.append(0, np.cumsum(values)), 1e-13)
 
 
-@pytest.mark.parametrize("form", [prefix_sums._blocked, prefix_sums._scanned])
-def test_sums_in_two_parts_are_exact(form):
-    """Of multiples of 2^-24 far from each other in size, whose sums float32 could not hold."""
-    rng = np.random.default_rng(7)
-    rows = np.exp(rng.normal(scale=5, size=(5, 3100)))
-    rows *= 2000 / rows.sum(axis=1, keepdims=True)
-    rows[rng.random(rows.shape) < 0.3] = 0
-    rows[0] = 0
-    rows[1, 100] = 3000
-    floors = np.floor(rows)
-    parts = np.round((rows - floors) * 2**24)
-    parts[2, 5] = 2**24  # as the fraction of a number just below the next
-    both = (jnp.asarray(floors, jnp.float32), jnp.asarray(parts, jnp.float32))
-    sums = [
-        np.asarray(found.whole, float) + np.asarray(found.fraction, float)
-        for found in jax.jit(jax.vmap(form))(*both)
-    ]
-    exact = np.cumsum(floors + parts / 2**24, axis=1)
-    np.testing.assert_array_equal(np.concatenate(sums, axis=1), np.pad(exact, ((0, 0), (1, 0))))
-
-
-def test_the_last_position_before_each_point():
-    rng = np.random.default_rng(7)
-    places = np.sort(np.round(rng.random(300) ** 2 * 64 * 2**12) / 2**12)
-    points = np.append(rng.random(500) * 64, places).astype(np.float32)
-    positions, sought = (
-        prefix_sums.Positions(indices(np.floor(values)), jnp.asarray(values % 1, jnp.float32))
-        for values in (places, points)
-    )
-    found = eqx.filter_jit(prefix_sums.last_before)(positions, sought, 64)
-    np.testing.assert_array_equal(found, np.searchsorted(places, points, "right") - 1)
-
-
-def test_random_positions_fill_lines_of_any_length_evenly():
-    lengths = indices(np.repeat([1, 3, 10**6, 2**30 + 1], 10_000))
-    drawn = jax.jit(prefix_sums.random_positions)(jax.random.key(0), lengths)
-    shares = (np.asarray(drawn.whole) + np.asarray(drawn.fraction, float)) / np.asarray(lengths)
-    for values in (shares, np.asarray(drawn.fraction)):
-        found = np.sort(values.reshape(4, -1), axis=1)
-        gaps = np.abs(found - np.linspace(0, 1, 10_000)[None]).max(axis=1)
-        assert (gaps < 0.02).all()  # Kolmogorov and Smirnov's statistic, of one in a thousand
+def test_units_keep_sums_of_values_in_any_order():
+    """Of a million values in turn, at random and sorted; float32 itself is off by hundreds."""
+    n, num_bits = 2**20, unit_bits(2**20)
+    values = np.exp(RNG.normal(scale=3, size=n))
+    values[RNG.random(n) < 0.3] = 0
+    for rows in (np.tile([1.4, 0.6], n // 2), values, np.sort(values)):
+        rows = np.asarray(rows * n / rows.sum(), np.float32)
+        units = np.asarray(jax.jit(to_units, static_argnums=1)(jnp.asarray(rows), num_bits))
+        assert (units[rows == 0] == 0).all()
+        exact = np.cumsum(rows.astype(float) * 2**num_bits)
+        assert np.abs(np.cumsum(units) - exact).max() < 200  # of 2^30
+        assert np.abs(units - rows.astype(float) * 2**num_bits).max() <= 64  # of the largest
 
 
 @pytest.mark.parametrize("n", [1, 16, 64, 65, 1025])

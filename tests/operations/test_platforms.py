@@ -11,7 +11,7 @@ from jax import export
 import mpfjax
 from mpfjax.models.observations import Series
 from mpfjax.operations import stored as forms
-from mpfjax.operations.prefix_sums import count_upto, exact_sum_before, sum_before
+from mpfjax.operations.prefix_sums import count_upto, sum_before
 from mpfjax.operations.stored import stored
 from mpfjax.running.scan import scan
 from tests.marking import quick_of
@@ -23,7 +23,6 @@ VALUES = jnp.abs(jnp.sin(jnp.arange(200.0)))
 KEY = jax.random.key(0)
 FORMS = {
     "sum_before": lambda: sum_before(VALUES),
-    "exact_sum_before": lambda: exact_sum_before(VALUES),
     "count_upto": lambda: count_upto((VALUES > 0.5).astype(jnp.int32), 200),
     "stored": lambda: stored(jnp.arange(200, dtype=jnp.int32)),
     "normal": lambda: mpfjax.normal(KEY, (200,)),

@@ -15,19 +15,14 @@ is drawn uniformly from the particle's own interval.
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.moves.resampling.allocation import Slots, place_slots
 from mpfjax.moves.resampling.line import Line
-from mpfjax.operations.prefix_sums import (
-    Positions,
-    count_starts,
-    count_upto,
-    last_before,
-    random_positions,
-)
-from mpfjax.operations.random import split, uniform
+from mpfjax.operations.prefix_sums import Positions, count_starts, count_upto, unit_bits
+from mpfjax.operations.random import fast_key, split, uniform
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import count_places, stored, take, whole_blocks
 
@@ -77,7 +72,7 @@ def draw_ancestors(
     slots = place_slots(targets, num_slots)
     shares = targets.astype(line.totals.dtype) / jnp.where(line.totals > 0, line.totals, 1.0)
     expected = line.weights * line.of_places(shares)
-    before, is_inside = line.positions(expected, targets, slots.firsts)
+    before, is_inside = line.positions(expected, targets, slots.firsts, num_slots)
     kept = None
     if keep is not None:
         key, key_kept = split(key, 2)
@@ -139,33 +134,18 @@ def _own_point(dealt: Dealt) -> Positions:
 
 
 def multinomial(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
-    points = random_points(key, dealt.slots, dealt.targets)
+    slots, num_places = dealt.slots, dealt.expected.shape[0]
+    num_slots = slots.components.shape[0]
+    num_bits = unit_bits(num_slots)
+    lengths = jnp.maximum(spread(dealt.targets, slots.components), 1) << num_bits
+    points = jax.random.randint(fast_key(key), lengths.shape, 0, lengths, jnp.int32)
+    points += spread(slots.firsts, slots.components) << num_bits
     if dealt.kept is not None:
-        points = _with_point(points, _own_point(dealt), dealt.slots.firsts[dealt.kept.component])
-    return _random_points_before(points, dealt.before, dealt.slots)
-
-
-def random_points(key: Key[Array, ""], slots: Slots, targets: Int[Array, " m"]) -> Positions:
-    """For each slot an independent uniform point on its component's interval of slots."""
-    lengths = jnp.maximum(spread(targets, slots.components), 1)
-    points = random_positions(key, lengths)
-    return Positions(points.whole + spread(slots.firsts, slots.components), points.fraction)
-
-
-def _with_point(points: Positions, point: Positions, slot: Int[Array, ""]) -> Positions:
-    """The points with another one for a slot."""
-    return Positions(
-        points.whole.at[slot].set(point.whole, mode="drop"),
-        points.fraction.at[slot].set(point.fraction, mode="drop"),
-    )
-
-
-def _random_points_before(points: Positions, before: Positions, slots: Slots) -> Int[Array, " p"]:
-    """How many of the points come before a particle's interval."""
-    num_places, num_slots = before.whole.shape[0], slots.components.shape[0]
-    parents = jnp.maximum(last_before(before, points, num_slots), 0)
+        own = _own_point(dealt).in_units(num_bits)
+        points = points.at[slots.firsts[dealt.kept.component]].set(own, mode="drop")
+    parents = jnp.searchsorted(dealt.before.in_units(num_bits), points, side="right") - 1
     # The points of empty slots are in no particle's interval.
-    places = jnp.where(slots.filled, parents, num_places)
+    places = jnp.where(slots.filled, jnp.maximum(parents, 0).astype(jnp.int32), num_places)
     offspring = count_places(places, whole_blocks(num_places + 1))[:num_places]
     return count_upto(offspring, num_slots) - offspring
 

@@ -28,13 +28,10 @@ from mpfjax.moves.resampling.sorting import (
 from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero, log_or_nothing
 from mpfjax.operations.prefix_sums import (
     Positions,
-    exact_sum_before,
-    growths,
-    in_slots,
-    needs_two_parts,
-    scales,
+    needs_units,
     sum_before,
-    unit_shift,
+    to_units,
+    unit_bits,
 )
 from mpfjax.operations.segments import (
     SideBySide,
@@ -108,47 +105,32 @@ class Line(NamedTuple):
         return firsts, jnp.maximum(-lasts, 0)
 
     def positions(
-        self, values: Float[Array, " p"], lengths: Int[Array, " m"], first_slots: Int[Array, " m"]
+        self,
+        values: Float[Array, " p"],
+        lengths: Int[Array, " m"],
+        first_slots: Int[Array, " m"],
+        num_slots: int,
     ) -> tuple[Positions, Bool[Array, " p"]]:
         """The start of each interval, in slots, and which of them are not after the last slot.
 
         The values are the lengths of the intervals; they sum to each component's length up to
         rounding.
         """
-        if needs_two_parts(values.shape[0], values.dtype):
-            return _sums_in_two_parts(self, values, lengths, first_slots)
+        num_places, dtype = values.shape[0], values.dtype
+        if needs_units(num_places, dtype):
+            num_bits = unit_bits(max(num_places, num_slots))
+            units = to_units(values, num_bits)
+            upto = jnp.cumsum(units, dtype=jnp.int32)
+            # From each component's own first slot, without the rounding errors of others.
+            before = upto - units
+            within = before - self.of_places(take(before, self.extents(drawn=False)[0]))
+            within = jnp.minimum(within, self.of_places(lengths << num_bits))
+            places = within + self.of_places(first_slots << num_bits)
+            return Positions.of_units(places, num_bits, dtype), before < upto[-1]
         before, total = sum_before(values)
         whole_parts = jnp.floor(before)
         positions = Positions(to_int(whole_parts, len(before)), before - whole_parts)
         return positions, before < total
-
-
-def _sums_in_two_parts(
-    line: Line,
-    values: Float[Array, " p"],
-    lengths: Int[Array, " m"],
-    first_slots: Int[Array, " m"],
-) -> tuple[Positions, Bool[Array, " p"]]:
-    """The sums from each component's own first slot, without the rounding errors of others."""
-    num_places = values.shape[0]
-    firsts, lasts = line.extents(drawn=False)
-    shift = unit_shift(lengths, lasts - firsts + 1)
-    scale = scales(line.sums(values), lengths << shift, num_places)
-    before, total = exact_sum_before(values * line.of_places(scale))
-    starts, nexts = before.at(firsts), before.at(jnp.minimum(lasts + 1, num_places - 1))
-    is_end = lasts == num_places - 1
-    ends = Positions(*(jnp.where(is_end, *pair) for pair in zip(total, nexts, strict=True)))
-    growth = growths(ends.after(starts), lengths << shift)
-    starts = Positions(*map(line.of_places, starts))
-    within = in_slots(before.after(starts), line.of_places(growth), line.of_places(shift))
-    is_inside = (before.whole < total.whole) | (before.fraction < total.fraction)
-    positions = Positions(within.whole + line.of_places(first_slots), within.fraction)
-    # A place after a component's last weight is exactly at its end.
-    ends = Positions(*map(line.of_places, ends))
-    is_after = (before.whole == ends.whole) & (before.fraction == ends.fraction)
-    end = line.of_places(first_slots + lengths)
-    whole = jnp.where(is_after, end, positions.whole)
-    return Positions(whole, jnp.where(is_after, 0.0, positions.fraction)), is_inside
 
 
 def in_line(
