@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import RULES, Count, Rule, check, check_one_each, kinds, saying, shown
 from mpfjax.models.noise import noise_dtype
-from mpfjax.operations.random import direction_numbers, normal, split
+from mpfjax.operations.random import normal, split
 
 
 class AbstractStateSpaceModel(eqx.Module):
@@ -118,13 +118,12 @@ def is_made_of_noise(model: Any, state: str = "transition") -> bool:
 
 
 def require_noise(model: Any, needed_by: str) -> None:
-    """Raise a `ValueError` unless the model can make x_t of noise from the Sobol table."""
+    """Raise a `ValueError` unless the model can make x_t of noise."""
     require(model, "transition_from_noise", needed_by)
     check(Count, noise_dimension=getattr(model, "noise_dimension", None))
     if not is_made_of_noise(model):
         who = f"model: {model_name(model)}, which has a sample_transition of its own,"
         raise ValueError(f"{who} inherits its transition_from_noise, which {needed_by} needs")
-    direction_numbers(model.noise_dimension)
 
 
 def require(model: Any, method: str, needed_by: str, argument: str = "model") -> None:

@@ -10,7 +10,6 @@ from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import (
-    MOST_DIMENSIONS,
     bits,
     normal,
     normal_quantile,
@@ -55,8 +54,6 @@ def draw_noise(
     noise of any two particles of different components is independent. Where particles stand as
     they did when they were last moved, the same slot would get the same point again, and two steps
     would be functions of each other. `shuffle` deals the points anew.
-
-    Raises `ValueError` for more dimensions than the table of direction numbers holds.
     """
     if kind == "independent":
         return normal(key, shape, dtype)
@@ -101,7 +98,7 @@ def draw_family_noise(
     shift_of_draws = jnp.repeat(shifts[1:d], num_draws if shifts.shape[1] > 1 else 1, axis=1)
     # A shuffled rank may be any number that has the digits of the largest.
     num_digits = _num_digits((num_draws << _num_digits(n)) if shuffle else num_draws * n)
-    directions = scrambled_directions(key_matrix, min(d + 1, MOST_DIMENSIONS), num_digits)
+    directions = scrambled_directions(key_matrix, d + 1, num_digits)
     first = sobol_points(ranks, directions[:1])[0] ^ shifts[0]
     last = sobol_points(ranks, directions[-1:])[0] ^ shifts[d]
     rest = sobol_points(draws, directions[1:d]) ^ shift_of_draws

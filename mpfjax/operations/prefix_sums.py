@@ -9,7 +9,7 @@ float32 has 24 bits: of a million slots that leaves four for the fraction, so th
 drawn too often or too seldom.
 """
 
-from functools import partial, reduce
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -28,7 +28,6 @@ from mpfjax.operations.stored import (
 )
 
 _ONE_BLOCK = 128
-_LANES_OF_ROWS = 4
 _FEWEST, _FEW = 16, 64
 # A sum in float32 of more numbers than these has too few bits for the fraction. The limit is a
 # number of particles, which is static: filters below it have the draws that they always had.
@@ -115,10 +114,8 @@ def few_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
     return sums if n <= _FEWEST else stored(sums)
 
 
-def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " num_slots"]:
+def count_starts(starts: Int[Array, " n"], num_slots: int) -> Int[Array, " num_slots"]:
     """For each slot s, the last i with starts_i <= s, given starts in ascending order.
-
-    Rows are one line, the first row first.
 
     If starts_i is the first slot of parent i, this is the parent of every slot, in O(n) and without
     a search: a one is added at each start, and the prefix sum counts them. A parent without
@@ -129,14 +126,7 @@ def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " 
     num_places = whole_blocks(num_slots + 1)
     dtype = jnp.float32 if starts.size < EXACT_IN_FLOAT32 else jnp.int32
     starts = stored(jnp.minimum(starts, num_slots))
-    if starts.ndim == 1 or starts.shape[0] == 1:
-        at_start = count_places(starts.reshape(-1), num_places, dtype)
-    else:  # a row has long runs without offspring, where the other rows have theirs
-        lane = jnp.arange(starts.shape[1], dtype=jnp.int32) % _LANES_OF_ROWS
-        places = (starts + num_places * lane[None]).reshape(-1)
-        lanes = count_places(places, _LANES_OF_ROWS * num_places, dtype)
-        # Written out: on several threads, XLA's sum over these few rows takes ten times as long.
-        at_start = reduce(jnp.add, lanes.reshape(_LANES_OF_ROWS, -1))
+    at_start = count_places(starts, num_places, dtype)
     return count_upto(at_start, starts.size)[:num_slots] - 1
 
 

@@ -43,30 +43,6 @@ _LOGARITHM = np.array([
 ], np.float32)  # fmt: skip
 _ROOT_OF_HALF = 0x3F3504F3
 _FRACTION = 0x7FFFFF
-# Joe and Kuo (2008), "Constructing Sobol sequences with better two-dimensional projections", the
-# set new-joe-kuo-6. For each dimension after the first: a, the inner coefficients of a primitive
-# polynomial of degree s as binary digits, and m_1 to m_s.
-_JOE_KUO = """
-    0 1; 1 1 3; 1 1 3 1; 2 1 1 1; 1 1 1 3 3; 4 1 3 5 13; 2 1 1 5 5 17; 4 1 1 5 5 5;
-    7 1 1 7 11 19; 11 1 1 5 1 1; 13 1 1 1 3 11; 14 1 3 5 5 31; 1 1 3 3 9 7 49; 13 1 1 1 15 21 21;
-    16 1 3 1 13 27 49; 19 1 1 1 15 7 5; 22 1 3 1 15 13 25; 25 1 1 5 5 19 61;
-    1 1 3 7 11 23 15 103; 4 1 3 7 13 13 15 69; 7 1 1 3 13 7 35 63; 8 1 3 5 9 1 25 53;
-    14 1 3 1 13 9 35 107; 19 1 3 1 5 27 61 31; 21 1 1 5 11 19 41 61; 28 1 3 5 3 3 13 69;
-    31 1 1 7 13 1 19 1; 32 1 3 7 5 13 19 59; 37 1 1 3 9 25 29 41; 41 1 3 5 13 23 1 55;
-    42 1 3 7 3 13 59 17; 50 1 3 1 3 5 53 69; 55 1 1 5 5 23 33 13; 56 1 1 7 7 1 61 123;
-    59 1 1 7 9 13 61 49; 62 1 3 3 5 3 55 33; 14 1 3 1 15 31 13 49 245; 21 1 3 5 15 31 59 63 97;
-    22 1 3 1 11 11 11 77 249; 38 1 3 1 11 27 43 71 9; 47 1 1 7 15 21 11 81 45;
-    49 1 3 7 3 25 31 65 79; 50 1 3 1 1 19 11 3 205; 52 1 1 5 9 19 21 29 157;
-    56 1 3 7 11 1 33 89 185; 67 1 3 3 3 15 9 79 71; 70 1 3 7 11 15 39 119 27;
-    84 1 1 3 1 11 31 97 225; 97 1 1 1 3 23 43 57 177; 103 1 3 7 7 17 17 37 71;
-    115 1 3 1 5 27 63 123 213; 122 1 1 3 5 11 43 53 133; 8 1 3 5 5 29 17 47 173 479;
-    13 1 3 3 11 3 1 109 9 69; 16 1 1 1 5 17 39 23 5 343; 22 1 3 1 5 25 15 31 103 499;
-    25 1 1 1 11 11 17 63 105 183; 44 1 1 5 11 9 29 97 231 363; 47 1 1 5 15 19 45 41 7 383;
-    52 1 3 7 7 31 19 83 137 221; 55 1 1 1 3 23 15 111 223 83; 59 1 1 5 13 31 15 55 25 161;
-    62 1 1 3 13 25 47 39 87 257
-"""
-_ROWS = tuple(tuple(map(int, row.split())) for row in _JOE_KUO.replace("\n", " ").split(";"))
-MOST_DIMENSIONS = 1 + len(_ROWS)
 _DIGITS = 32
 
 
@@ -293,34 +269,20 @@ _UNROLLED = define_prng_impl(
 
 
 @functools.cache
-def direction_numbers(dimension: int, num_digits: int = _DIGITS) -> np.ndarray:
+def direction_numbers(dimension: int, num_digits: int) -> np.ndarray:
     """V_jb for the digits b of an index, lowest first, (dimension, num_digits), in 32 bits.
 
-    The highest bit is the first binary digit of a coordinate. Raises `ValueError` for more
-    dimensions than the table holds.
+    The highest bit is the first binary digit of a coordinate. They are those of Joe and Kuo (2008),
+    as scipy has them, up to 21 201 dimensions.
     """
-    if not 1 <= dimension <= MOST_DIMENSIONS:
-        raise ValueError(
-            f"noise_dimension: {dimension} is not in 1, ..., {MOST_DIMENSIONS}, the dimensions"
-            " that the table of direction numbers holds"
-        )
-    first = [1] * num_digits
-    numbers = [first, *(_recurrence(row, num_digits) for row in _ROWS[: dimension - 1])]
-    shifts = np.arange(_DIGITS - 1, _DIGITS - 1 - num_digits, -1, dtype=np.uint32)
-    return np.array(numbers, np.uint32) << shifts[None]
+    from scipy.stats import qmc  # takes a second, and few filters need it
 
-
-def _recurrence(row: tuple[int, ...], num_digits: int) -> list[int]:
-    """m_1, ..., m_num_digits of a dimension, from the first of them and its polynomial."""
-    inner, *numbers = row
-    degree = len(numbers)
-    for k in range(degree, num_digits):
-        value = numbers[k - degree] ^ (numbers[k - degree] << degree)
-        for i in range(1, degree):
-            if inner >> (degree - 1 - i) & 1:
-                value ^= numbers[k - i] << i
-        numbers.append(value)
-    return numbers[:num_digits]
+    points, numbers = qmc.Sobol(dimension, scramble=False, bits=_DIGITS), []
+    for b in range(num_digits):
+        # In the Gray code of its number, point 2^(b + 1) - 1 has the digit b alone.
+        points.fast_forward(max(2**b - 1, 1))
+        numbers.append(points.random(1)[0])
+    return (np.transpose(numbers) * 2.0**_DIGITS).astype(np.uint32)
 
 
 def sobol_points(

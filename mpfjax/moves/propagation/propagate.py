@@ -150,9 +150,8 @@ class Propagate(_Propagation, AbstractPropagationOfEach):
       about those of independent noise. Take it where masses and likelihoods must be accurate.
 
     Raises `ValueError` for another gradient or noise; in a filter, for a proposal, or "stop", with
-    a model that has no `log_transition`; for noise that is not independent, with a model that has
-    no `transition_from_noise`, or a proposal that has no `propose_from_noise`; and for more noise
-    dimensions than there are Sobol direction numbers, 64.
+    a model that has no `log_transition`; and for noise that is not independent, with a model that
+    has no `transition_from_noise`, or a proposal that has no `propose_from_noise`.
     """
 
 
