@@ -8,13 +8,15 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Key, PyTree
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, checked, kinds, shown
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, replaced, with_inputs
 from mpfjax.models.noise import Noise
-from mpfjax.models.observations import Fault, faults_of, one_input, one_observation, raise_faults
+from mpfjax.models.observations import one_input, one_observation
 from mpfjax.moves.alarm import SURPRISE, hearing
 from mpfjax.moves.base import (
     AbstractMove,
@@ -128,12 +130,12 @@ class Filter(eqx.Module):
         `SelectInitial`; without y_1 that move does nothing. y_1 is then given to `step` as well.
         """
         if observation is not None:
-            observation = one_observation(observation)
+            observation = one_observation(observation, self.model)
         inputs = one_input(inputs, self.model)
         keys = split(key, 1 + len(self.initial_moves))
         # Not in one program with the moves, on which the last digits of the draws would depend.
         particles = drawn_once(keys[0], self._sample_initial)
-        return raise_faults(*_start(self, keys, observation, inputs, particles))
+        return _start(self, keys, observation, inputs, particles)
 
     @checked
     def step(
@@ -151,7 +153,7 @@ class Filter(eqx.Module):
         increment is -inf, the particles keep the weights that they had before, and `degenerate`
         is true.
         """
-        return self._run(key, mixture, one_observation(observation), inputs)
+        return self._run(key, mixture, one_observation(observation, self.model), inputs)
 
     @checked
     def predict(
@@ -169,8 +171,8 @@ class Filter(eqx.Module):
         if (given := mixture.num_components) != (own := self.num_components):
             raise ValueError(f"mixture: num_components, {given}, is not the filter's, {own}")
         inputs = one_input(inputs, self.model)
-        *moved, faults = _one_step(self, key, mixture, observation, inputs)
-        return raise_faults(tuple(moved), faults)
+        moved, info = _one_step(self, key, mixture, observation, inputs)
+        return with_densities((moved, info), info.log_likelihood_increment)
 
     # Within a program.
 
@@ -233,29 +235,32 @@ class Filter(eqx.Module):
             mixture, evidence = hearing(self.moves, mixture, now, increment)
         return mixture, report_of(mixture, increment, resampled, evidence)
 
-    def _step_and_faults(
-        self,
-        key: Key[Array, "*keys"],
-        mixture: ParticleMixture,
-        observation: PyTree,
-        inputs: PyTree = None,
-    ) -> tuple[ParticleMixture, StepInfo, tuple[Fault, ...]]:
-        """A step, and what `raise_faults` needs when the program has ended."""
-        faults = faults_of(self.model, observation, inputs)
-        moved, info = self.with_inputs(inputs)._step(key, mixture, observation)
-        broken = Fault(~(info.log_likelihood_increment < jnp.inf), BROKEN_DENSITY)
-        return moved, info, (*faults, broken)
 
-    def _start_and_faults(
-        self, keys: Key[Array, " keys"], observation: PyTree, inputs: PyTree, particles: PyTree
-    ) -> tuple[ParticleMixture, tuple[Fault, ...]]:
-        """The same for the mixture of x_0, of these particles."""
-        faults = faults_of(self.model, observation, inputs)
-        return self.with_inputs(inputs)._init(keys, observation, particles), faults
+@jit_with_floats_traced
+def _one_step(filter, key, mixture, observation, inputs):
+    return filter.with_inputs(inputs)._step(key, mixture, observation)
 
 
-_one_step = jit_with_floats_traced(Filter._step_and_faults)
-_start = jit_with_floats_traced(Filter._start_and_faults)
+@jit_with_floats_traced
+def _start(filter, keys, observation, inputs, particles):
+    return filter.with_inputs(inputs)._init(keys, observation, particles)
+
+
+def with_densities(value: PyTree, increments: Float[Array, "*runs_and_t"]) -> PyTree:
+    """`value`, or a RuntimeError where an increment of log Ẑ is NaN or +inf.
+
+    A program that raises errors itself calls back into Python, and such a program cannot be kept
+    for the next process. So increments are looked at after it has ended. Under the caller's own jit
+    the error is raised while the program runs.
+    """
+    if isinstance(increments, Tracer):
+        return eqx.error_if(value, ~(increments < jnp.inf), BROKEN_DENSITY)
+    broken = ~(np.asarray(increments) < np.inf)
+    if broken.any():
+        step = int(np.argmax(broken.any(axis=tuple(range(broken.ndim - 1))))) if broken.ndim else 0
+        at = f", first at index {step} of the steps" if broken.ndim else ""
+        raise RuntimeError(f"{BROKEN_DENSITY}{at}")
+    return value
 
 
 def propagation_of(moves: Moves) -> AbstractPropagationOfEach | None:

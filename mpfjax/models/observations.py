@@ -80,7 +80,7 @@ def steps_of_inputs(
     inputs: PyTree, length: int, model: Any, of_what: str = "observations"
 ) -> PyTree:
     """u_1, ..., u_t as arrays; a `ValueError` unless they are finite numbers, one for each step."""
-    arrays = one_input(inputs, model, in_time=True)
+    arrays = _inputs(inputs, model, in_time=True)
     if arrays is None:
         return None
     own_length = _length(arrays, inputs, "inputs")
@@ -90,8 +90,15 @@ def steps_of_inputs(
     return refused_where(~usable, arrays, f"inputs: {NOT_FINITE}")
 
 
-def one_input(inputs: PyTree, model: Any, in_time: bool = False) -> PyTree:
-    """The arrays of u_t; a `ValueError` for anything but numbers, or a model without inputs."""
+def one_input(inputs: PyTree, model: Any) -> PyTree:
+    """The arrays of u_t; a `ValueError` for numbers not finite, and a model without inputs."""
+    arrays = _inputs(inputs, model, in_time=False)
+    if arrays is None:
+        return None
+    return refused_where(~_is_usable(arrays, NOT_FINITE), arrays, f"inputs: {NOT_FINITE}")
+
+
+def _inputs(inputs: PyTree, model: Any, in_time: bool) -> PyTree:
     if inputs is None:
         return None
     if not takes_inputs(model):
@@ -107,45 +114,21 @@ def as_arrays(observations: PyTree, name: str = "observations", in_time: bool = 
     return jax.tree.map(lambda leaf: as_numbers(name, leaf, in_time=in_time), observations)
 
 
-def one_observation(observation: PyTree) -> PyTree:
-    """The arrays of y_t; a `ValueError` for none, anything but numbers, and too large ones."""
-    return as_arrays(observation, "observation", in_time=False)
+def one_observation(observation: PyTree, model: Any = None) -> PyTree:
+    """The arrays of y_t; a `ValueError` for none, anything but numbers, and what a model refuses.
 
-
-class Fault(eqx.Module):
-    """Whether a program met a fault for which `raise_faults` is to raise, and which."""
-
-    found: Bool[Array, "*runs"]
-    message: str = eqx.field(static=True)
-
-
-def faults_of(model: Any, observation: PyTree, inputs: PyTree) -> tuple[Fault, ...]:
-    """Whether y_t or u_t holds a number that the model does not take."""
-    faults, told = [], "; use predict to skip it"
-    for name, tree, refused, hint in (
-        ("observation", observation, refused_by(model), told),
-        ("inputs", inputs, NOT_FINITE, ""),
-    ):
-        inexact = [leaf for leaf in jax.tree.leaves(tree) if _is_inexact(leaf)]
-        if inexact:
-            usable = [jnp.all(_USABLE[refused](jnp, leaf)) for leaf in inexact]
-            faults.append(Fault(~jnp.all(jnp.stack(usable)), f"{name}: {refused}{hint}"))
-    return tuple(faults)
-
-
-def raise_faults(value: PyTree, faults: tuple[Fault, ...]) -> PyTree:
-    """`value`, or a RuntimeError for the first of the faults that was found in any run.
-
-    A program that raises errors itself calls back into Python, and such a program cannot be kept
-    for the next process. It therefore returns its faults, which are checked after it has ended.
-    Under the caller's own jit the error is raised while the program runs.
+    Under the caller's own jit, the program raises for a number that the model refuses.
     """
-    for fault in faults:
-        if isinstance(fault.found, Tracer):
-            value = eqx.error_if(value, fault.found, fault.message)
-        elif np.any(fault.found):
-            eqx.error_if(fault.found, fault.found, fault.message)
-    return value
+    arrays = as_arrays(observation, "observation", in_time=False)
+    refused = "" if model is None else refused_by(model)
+    broken = ~_is_usable(arrays, refused)
+    return refused_where(broken, arrays, f"observation: {refused}", "; use predict to skip it")
+
+
+def _is_usable(arrays: PyTree, refused: str) -> Any:
+    """Whether all numbers of one step are."""
+    one_step = jax.tree.map(lambda leaf: leaf[None], arrays)
+    return _steps_where(one_step, "all", _USABLE[refused])[0]
 
 
 def present_steps(observations: PyTree, series: Series, refused: str) -> Any:

@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import saying, warn
-from mpfjax.filter import BROKEN_DENSITY, Filter
+from mpfjax.filter import Filter, with_densities
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import Series
 from mpfjax.moves.initial import SelectInitial
@@ -178,11 +178,9 @@ def sound(run: FilterRun, free: bool = True) -> FilterRun:
     and where at the end all hypotheses seem wrong.
     """
     increments = run.log_likelihood_increments
+    run = with_densities(run, increments)
     if isinstance(increments, Tracer):
-        return eqx.error_if(run, ~(increments < jnp.inf), BROKEN_DENSITY)
-    bad = ~(np.asarray(increments) < np.inf).all(axis=tuple(range(increments.ndim - 1)))
-    if bad.any():
-        raise RuntimeError(f"{BROKEN_DENSITY}, first at index {int(np.argmax(bad))} of the steps")
+        return run
     degenerate = np.asarray(run.degenerate)
     is_blind = degenerate.any(axis=-1) & (degenerate | (np.asarray(increments) == 0)).all(axis=-1)
     if is_blind.any():

@@ -220,7 +220,7 @@ class FixedLagSmoother(Checked):
         missing; `inputs` are u_t.
         """
         key_step, key_draws = jax.random.split(key)
-        seen = None if observation is None else one_observation(observation)
+        seen = None if observation is None else one_observation(observation, self.filter.model)
         moved, info = self.filter._run(key_step, window.mixture, seen, inputs)
         inputs = one_input(inputs, self.filter.model)
         return *_advanced(self, key_draws, window, moved, inputs), info

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import Count, CountOrZero, checked, to_rows
-from mpfjax.filter import Filter
-from mpfjax.models.observations import one_observation, raise_faults
+from mpfjax.filter import Filter, with_densities
+from mpfjax.models.observations import one_observation
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
 from mpfjax.operations.random import split_once
 from mpfjax.vision.boxes.hypotheses import LearnedColourModel, best_components, component_references
@@ -57,24 +57,24 @@ def follow(
     mixtures = jax.vmap(filter.init)(keys)
     for t, frame in enumerate(frames):
         step = jnp.asarray(t)  # an array: a new Python number would compile again
-        mixtures, snapshot, faults = _advance(
+        mixtures, snapshot, increments = _advance(
             keys, filter, step, mixtures, jnp.asarray(one_observation(frame))
         )
-        yield jax.tree.map(np.asarray, raise_faults(snapshot, faults))
+        yield jax.tree.map(np.asarray, with_densities(snapshot, jnp.max(increments)))
 
 
 @eqx.filter_jit
 def _advance(keys, filter, t, mixtures, frame):
     def step(key, mixture):
         step_key = jax.random.fold_in(key, t)
-        mixture, _, faults = filter._step_and_faults(step_key, mixture, frame)
+        mixture, info = filter._step(step_key, mixture, frame)
         places = filter.model.boxes(mixture.particles)
         labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
         means = mixture.component_averages(places)
         carried = hasattr(mixture.particles, "reference")
         references = component_references(mixture) if carried else None
         snapshot = Snapshot(means, mixture.active, places[:, :2], labels, references)
-        return mixture, snapshot, faults
+        return mixture, snapshot, info.log_likelihood_increment
 
     # The frame is not mapped over, so its histogram is built once for all runs.
     return jax.vmap(step)(keys, mixtures)
@@ -180,13 +180,13 @@ def follow_boxes(
     for t, still in enumerate(itertools.chain([first], stills)):
         # An array: each new Python number would compile anew.
         counted = None if still is None else count(model, still, soon=True)
-        mixture, tracks, faults = advance(filter, len(boxes), key, np.asarray(t), mixture, counted)
-        yield jax.device_get(raise_faults(tracks, faults))
+        mixture, tracks, growth = advance(filter, len(boxes), key, np.asarray(t), mixture, counted)
+        yield jax.device_get(with_densities(tracks, growth))
 
 
 def _advance_boxes(filter, num_objects, key, t, mixture, counted):
     step_keys = split_once(jax.random.fold_in(key, t), len(filter.moves))
-    mixture, _, faults = filter._step_and_faults(step_keys, mixture, counted)
+    mixture, info = filter._step(step_keys, mixture, counted)
     best, held = best_components(mixture, num_objects)
     means = mixture.component_averages(filter.model.boxes(mixture.particles))
     identities = jnp.where(held, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)
@@ -195,4 +195,4 @@ def _advance_boxes(filter, num_objects, key, t, mixture, counted):
     full = jnp.zeros((), bool)
     told = full, held, none, never, unseen, jnp.ones(num_objects)
     tracks = Tracks(means[best], identities, held, unseen, *told)
-    return mixture, tracks, faults
+    return mixture, tracks, info.log_likelihood_increment
