@@ -49,13 +49,12 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
       particles and objects, and its result goes to `log_likelihood`.
     - `shared_inputs`: with True, all objects have the same known inputs u_t. With False, object j
       has `inputs[j]`, every leaf indexed by j.
-    - `per_object`: whether the arrays have an object axis. None finds it out by tracing the
-      model's draws both ways, without computing them.
+    - `per_object`: whether the arrays have an object axis. With None they have one if the model
+      cannot be drawn without, which is traced and not computed.
 
-    Particles have leaves (n, J, ...). Raises `ValueError` for J < 1, an object model that works
-    neither way or, for `per_object=None`, both ways, one that lacks a method, and one that is
-    conditionally linear. Use it where objects interact or share particles; without interaction
-    `independent_particle_filters` is better.
+    Particles have leaves (n, J, ...). Raises `ValueError` for J < 1, an object model that lacks a
+    method or the object axis, and one that is conditionally linear. Use it where objects interact
+    or share particles; without interaction `independent_particle_filters` is better.
     """
 
     object_model: AbstractStateSpaceModel
@@ -317,22 +316,7 @@ def _has_axis(model: Any, num_objects: int) -> bool:
 
 
 def _finds_object_axis(model: Any, num_objects: int) -> bool:
-    """Whether the model's arrays carry an object axis, by trying to draw from it both ways."""
-    if not _has_axis(model, num_objects):
-        return False
-    one = jax.tree.map(lambda leaf: leaf[0] if _is_array(leaf) else leaf, model)
-    one_for_all, one_each = _error_of_draws(model), _error_of_draws(one)
-    if (one_for_all is None) == (one_each is None) and (num_objects > 1 or one_each is not None):
-        ways = "both" if one_each is None else "neither"
-        raise ValueError(
-            f"object_model: {type(model).__name__} can be drawn from {ways} as one model for all"
-            f" objects and as {num_objects} models side by side; say which with per_object"
-        ) from one_for_all
-    return one_for_all is not None
-
-
-def _error_of_draws(model: Any) -> Exception | None:
-    """The error of drawing x_0 and x_1 from the model, traced without arithmetic, or None."""
+    """Whether the arrays have an object axis, because as one model for all it cannot be drawn."""
 
     def draw() -> None:
         key = jax.random.key(0)
@@ -342,6 +326,6 @@ def _error_of_draws(model: Any) -> Exception | None:
 
     try:
         eqx.filter_eval_shape(draw)
-    except Exception as error:
-        return error
-    return None
+    except Exception:
+        return _has_axis(model, num_objects)
+    return False

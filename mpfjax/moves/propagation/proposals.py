@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import POSITIVE, Count, Positive, checked, to_array
 from mpfjax.models.base import require
+from mpfjax.models.steps import likelihoods, log_transition
 from mpfjax.moves.base import Given, Step
 from mpfjax.operations.matrices import cholesky, solve_lower
 from mpfjax.operations.random import normal
@@ -200,22 +201,12 @@ class GaussNewtonProposal(_GaussianProposal):
         `LinearGaussianModel`. It does not depend on the inflation. Use it as the look-ahead of
         `AuxiliaryResample`.
         """
-        model: Any = now.model
         prior_means, means, factors = self._fit(now, previous_states)
-        seen = model.observation_mean(means.reshape(prior_means.shape)).reshape(len(means), -1)
-        covariance_y = _matrix(model.observation_covariance).astype(means.dtype)
-        covariance = _matrix(model.transition_covariance).astype(means.dtype)
-        missed = jnp.atleast_1d(now.observation).astype(means.dtype)[None] - seen
-        moved = means - prior_means.reshape(means.shape)
-        squares = jnp.einsum("np,pq,nq->n", missed, _inverse(covariance_y), missed)
-        squares = squares + jnp.einsum("nd,de,ne->n", moved, _inverse(covariance), moved)
-        log_volume = -jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
-        log_scale = 0.5 * (
-            covariance_y.shape[0] * jnp.log(2 * jnp.pi)
-            + jnp.linalg.slogdet(covariance_y)[1]
-            + jnp.linalg.slogdet(covariance)[1]
-        )
-        return log_volume - 0.5 * squares - log_scale.astype(means.dtype)
+        states = means.reshape(prior_means.shape)
+        log_densities = likelihoods(now.model, now.observation, states)
+        log_densities += log_transition(now.model, states, previous_states)
+        log_precision = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
+        return log_densities + 0.5 * means.shape[1] * jnp.log(2 * jnp.pi) - log_precision
 
     def _fit(
         self, now: Step, previous_states: Float[Array, "n ..."]
