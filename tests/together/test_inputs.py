@@ -294,7 +294,7 @@ def run(filter=FILTER, observations=OBSERVATIONS, collect=mean, inputs=INPUTS, *
 
 @pytest.mark.exactness
 def test_an_input_of_a_step_that_is_nan_or_not_there_is_an_error():
-    with pytest.raises(RuntimeError, match="inputs: NaN or infinite"):
+    with pytest.raises(ValueError, match="inputs: NaN or infinite"):
         FILTER.step(KEY, FILTER.init(KEY), OBSERVATIONS[0], inputs=built_in(u=np.nan))
     with pytest.raises(TypeError) as caught:
         FILTER.step(KEY, FILTER.init(KEY), OBSERVATIONS[0])
