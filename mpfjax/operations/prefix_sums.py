@@ -160,8 +160,8 @@ def needs_units(num_values: int, dtype: jnp.dtype) -> bool:
 
 
 def unit_bits(num_slots: int) -> int:
-    """Units are 2^-b slots: the most bits with which this many slots are below 2^30 units."""
-    return 30 - num_slots.bit_length()
+    """b, with units of 2^-b slots: the most with which so many slots are not above 2^30 units."""
+    return 30 - (num_slots - 1).bit_length()
 
 
 def to_units(values: Float[Array, " n"], num_bits: int) -> Int[Array, " n"]:

@@ -18,7 +18,7 @@ from mpfjax.models.steps import log_transition
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.prefix_sums import needs_units, sum_before, to_units, unit_bits
-from mpfjax.operations.random import split, uniform
+from mpfjax.operations.random import below, split, uniform
 from mpfjax.operations.stored import take
 
 # How many densities are held at once: rows of states are taken together up to this.
@@ -35,7 +35,7 @@ def draw(
     if needs_units(n, dtype):
         units = to_units(weights * (n / jnp.sum(weights)), unit_bits(n))
         upto = jnp.cumsum(units, dtype=jnp.int32)
-        target = jax.random.randint(key, shape, 0, upto[-1], jnp.int32)
+        target = below(key, jnp.broadcast_to(upto[-1], shape))
         indices = jnp.searchsorted(upto, target, side="right").astype(jnp.int32)
     else:
         before, total = sum_before(weights)

@@ -8,6 +8,7 @@ from scipy.special import erfinv, log_ndtr
 
 import mpfjax
 from mpfjax.operations.random import (
+    below,
     bits,
     fast_key,
     normal,
@@ -127,6 +128,13 @@ class KeySpy(mpfjax.QuadraticModel):
 
 
 seen: list[str] = []
+
+
+def test_whole_numbers_below_are_upper_halves_of_products():
+    spans = np.repeat([1, 3, 10**6, 22_000_000, 2**30], 100)
+    words = np.asarray(bits(KEY, spans.shape)).astype(np.uint64)
+    found = below(KEY, jnp.asarray(spans, jnp.int32))
+    np.testing.assert_array_equal(found, words * spans.astype(np.uint64) >> np.uint64(32))
 
 
 @pytest.mark.exactness

@@ -15,14 +15,13 @@ is drawn uniformly from the particle's own interval.
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.moves.resampling.allocation import Slots, place_slots
 from mpfjax.moves.resampling.line import Line
 from mpfjax.operations.prefix_sums import Positions, count_starts, count_upto, unit_bits
-from mpfjax.operations.random import fast_key, split, uniform
+from mpfjax.operations.random import below, split, uniform
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import count_places, stored, take, whole_blocks
 
@@ -138,8 +137,7 @@ def multinomial(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
     num_slots = slots.components.shape[0]
     num_bits = unit_bits(num_slots)
     lengths = jnp.maximum(spread(dealt.targets, slots.components), 1) << num_bits
-    points = jax.random.randint(fast_key(key), lengths.shape, 0, lengths, jnp.int32)
-    points += spread(slots.firsts, slots.components) << num_bits
+    points = below(key, lengths) + (spread(slots.firsts, slots.components) << num_bits)
     if dealt.kept is not None:
         own = _own_point(dealt).in_units(num_bits)
         points = points.at[slots.firsts[dealt.kept.component]].set(own, mode="drop")
