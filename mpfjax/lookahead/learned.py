@@ -126,7 +126,7 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
         if isinstance(move, Resample):
             # Masses of today tell little where ψ knows what is to come: each ψ_t errs by its fit.
             return AuxiliaryResample(dataclasses.replace(move, allocation="equal"), twist)
-        if hasattr(move, "from_noise") and move.gradient == "none":
+        if hasattr(move, "proposal") and move.gradient == "none":
             return PropagateTwisted(dataclasses.replace(move, proposal=None), twist)
         if isinstance(move, Every):
             return move.map_inner(ahead)

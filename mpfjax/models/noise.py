@@ -5,7 +5,6 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from mpfjax.operations.logarithms import default_float
@@ -63,7 +62,17 @@ def draw_noise(
         ranks = _shuffled_ranks(key_second, jnp.arange(n, dtype=jnp.int32)).astype(jnp.uint32)
         points = ranks[:, None] * _multipliers(d)[None] + bits(key_first, (d,))[None]
         return normal_of(points, dtype)
-    ranks, shifts = _ranks_and_shifts(key_second, shape, components, num_components, shuffle)
+    ranks = jnp.arange(n, dtype=jnp.int32)
+    number = 1 if components is None else num_components
+    shifts = stored(bits(key_second, (number, d)) >> _UNUSED)
+    if components is None or number == 1:
+        shifts = shifts.T << _UNUSED
+    else:
+        ranks = stored(ranks - spread(first_places(components, num_components), components))
+        of_slots = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
+        shifts = stored(of_slots) << _UNUSED
+    if shuffle:
+        ranks = _shuffled_ranks(jax.random.fold_in(key_second, 1), ranks)
     if d == 1:
         points = (ranks.astype(jnp.uint32) * _multipliers(1))[None] + shifts
     else:
@@ -71,64 +80,6 @@ def draw_noise(
         points = sobol_points(ranks, directions) ^ shifts
     # Drawn row by row, then transposed: operations on short rows are not vectorised.
     return stored(normal_of(points, dtype)).T
-
-
-def draw_family_noise(
-    key: Key[Array, ""],
-    shape: tuple[int, int],
-    num_draws: int,
-    dtype: jnp.dtype,
-    components: Int[Array, " n"],
-    num_components: int,
-    shuffle: bool = False,
-) -> tuple[Float[Array, "nk d"], Float[Array, " n"]]:
-    """Noise for K draws of each particle, side by side, and a uniform number for each particle.
-
-    They are made of one point set of d + 1 dimensions. In the first, the K draws of a particle fill
-    K strata, in order: a draw's noise on its own is not normal, but one of the K at random is. So
-    an average over the draws keeps its expectation. The last dimension is the uniform number, by
-    which one of the draws is kept. Each particle's share of the point set is independent of the
-    past, and its uniform number of its noise. `shuffle` is that of `draw_noise`.
-    """
-    n, d = shape
-    key_matrix, key_shift = split(key, 2)
-    ranks, shifts = _ranks_and_shifts(key_shift, (n, d + 1), components, num_components, shuffle)
-    draw = jnp.arange(num_draws, dtype=jnp.int32)[None]
-    draws = jnp.ravel(ranks[:, None] * num_draws + draw)
-    shift_of_draws = jnp.repeat(shifts[1:d], num_draws if shifts.shape[1] > 1 else 1, axis=1)
-    # A shuffled rank may be any number that has the digits of the largest.
-    num_digits = _num_digits((num_draws << _num_digits(n)) if shuffle else num_draws * n)
-    directions = scrambled_directions(key_matrix, d + 1, num_digits)
-    first = sobol_points(ranks, directions[:1])[0] ^ shifts[0]
-    last = sobol_points(ranks, directions[-1:])[0] ^ shifts[d]
-    rest = sobol_points(draws, directions[1:d]) ^ shift_of_draws
-    strata = draw.astype(jnp.uint32) * np.uint32((2**32 // num_draws) % 2**32)
-    points = jnp.concatenate([jnp.ravel(first[:, None] // num_draws + strata)[None], rest])
-    return stored(normal_of(points, dtype)).T, uniform_of(last, dtype)
-
-
-def _ranks_and_shifts(
-    key: Key[Array, ""],
-    shape: tuple[int, ...],
-    components: Int[Array, " n"] | None,
-    num_components: int,
-    shuffle: bool,
-) -> tuple[Int[Array, " n"], UInt32[Array, "d #n"]]:
-    """The rank of each slot in its component, and the shift of the component's points."""
-    n, d = shape
-    ranks = jnp.arange(n, dtype=jnp.int32)
-
-    def dealt(ranks: Int[Array, " n"]) -> Int[Array, " n"]:
-        return _shuffled_ranks(jax.random.fold_in(key, 1), ranks) if shuffle else ranks
-
-    if components is None:
-        num_components = 1
-    shifts = stored(bits(key, (num_components, d)) >> _UNUSED)
-    if components is None or num_components == 1:
-        return dealt(ranks), shifts.T << _UNUSED
-    ranks = stored(ranks - spread(first_places(components, num_components), components))
-    of_slots = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
-    return dealt(ranks), stored(of_slots) << _UNUSED
 
 
 def _shuffled_ranks(key: Key[Array, ""], ranks: Int[Array, " n"]) -> Int[Array, " n"]:

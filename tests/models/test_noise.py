@@ -11,7 +11,7 @@ import pytest
 import scipy.stats
 from scipy.stats import qmc
 
-from mpfjax.models.noise import draw_family_noise, draw_noise, stratified_uniform
+from mpfjax.models.noise import draw_noise, stratified_uniform
 from mpfjax.moves.resampling.sorting import (
     bits_per_dimension,
     hilbert_index,
@@ -111,25 +111,14 @@ def test_shuffled_indices_are_a_permutation_that_keeps_blocks_together():
         assert (blocks == blocks[:, :, :1]).all()
 
 
-N, FAMILY = 30, 4
+N = 30
 LABELS = jnp.asarray(np.sort(np.random.default_rng(2).integers(0, 3, N)), jnp.int32)
-
-
-def of_family(key, d, num_draws=FAMILY):
-    return draw_family_noise(key, (N, d), num_draws, FLOAT, LABELS, 3)
-
-
-def one_of_family(key, d):
-    noise, _ = of_family(key, d)
-    which = jax.random.randint(jax.random.fold_in(key, 1), (N,), 0, FAMILY)
-    return noise[jnp.arange(N) * FAMILY + which]
 
 
 DRAWS = {
     "stratified": lambda key, d: draw_noise(key, "stratified", (N, d), FLOAT),
     "rqmc": lambda key, d: draw_noise(key, "rqmc", (N, d), FLOAT, LABELS, 3),
     "rqmc, dealt anew": lambda key, d: draw_noise(key, "rqmc", (N, d), FLOAT, LABELS, 3, True),
-    "one of a family": one_of_family,
 }
 
 
@@ -145,9 +134,7 @@ def assert_independent(one, other):
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize(
-    ("name", "d"), [("rqmc", 1), ("one of a family", 1), *((name, 3) for name in DRAWS)]
-)
+@pytest.mark.parametrize(("name", "d"), [("rqmc", 1), *((name, 3) for name in DRAWS)])
 def test_each_row_on_its_own_is_exactly_normal_and_its_columns_are_independent(name, d):
     found = draws(name, d)
     for row in (0, 1, 13, 29):
@@ -206,31 +193,3 @@ def test_a_hundred_thousand_rows_stay_finite_and_uniform_ones_fill_each_cell():
         assert len(np.unique(noise[:, 0])) > 99_000
     points = np.asarray(stratified_uniform(KEYS[0], 50))
     np.testing.assert_array_equal(np.sort(np.floor(50 * points)), np.arange(50))
-
-
-@pytest.mark.parametrize("num_draws", [FAMILY, 2])
-def test_draws_of_a_particle_fill_strata_and_its_share_is_uniform_and_independent(num_draws):
-    """Two strata are half of all numbers of 32 bits each, which int32 does not hold."""
-    noise, shares = jax.jit(jax.vmap(lambda key: of_family(key, 1, num_draws)))(KEYS)
-    noise, shares = np.asarray(noise).reshape(len(KEYS), N, num_draws), np.asarray(shares)
-    strata = np.floor(num_draws * scipy.stats.norm.cdf(noise)).astype(int)
-    assert (strata == np.arange(num_draws)).all()
-    for slot, draw in itertools.product((0, 7, 29), (0, num_draws - 1)):
-        assert scipy.stats.kstest(shares[:, slot], "uniform").pvalue > 1e-4
-        levels = scipy.stats.rankdata(noise[:, slot, draw]) / len(KEYS)
-        both = np.mod(shares[:, slot] + levels, 1)
-        assert scipy.stats.kstest(both, "uniform").pvalue > 1e-4
-
-
-@pytest.mark.exactness
-def test_families_and_what_they_keep_are_one_net():
-    """One of all draws in each cell of a coordinate; a draw kept by its share is even as well."""
-    n, labels = 64, jnp.zeros(64, jnp.int32)
-    draw = jax.vmap(lambda key: draw_family_noise(key, (n, 2), FAMILY, FLOAT, labels, 1))
-    noise, shares = map(np.asarray, jax.jit(draw)(KEYS[:200]))
-    points = np.floor(n * FAMILY * scipy.stats.norm.cdf(noise)).astype(int)
-    assert (np.sort(points, axis=1) == np.arange(n * FAMILY)[None, :, None]).all()
-    kept = np.floor(FAMILY * shares).astype(int)
-    first = noise[..., 0].reshape(-1, n, FAMILY)
-    means = np.take_along_axis(first, kept[..., None], axis=2).mean(axis=(1, 2))
-    assert means.std() < 0.25 / np.sqrt(n)

@@ -5,11 +5,10 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Key
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.noise import draw_family_noise, noise_dtype
 from mpfjax.moves.base import AbstractPropagationOfEach, AbstractWrapper, Step, is_missing
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.operations.random import split, uniform
@@ -25,10 +24,8 @@ class PropagateNested(AbstractPropagationOfEach, AbstractWrapper):
     of K N particles that keeps one child of each parent. Ẑ is that of K N particles, and unbiased.
     The model is evaluated K N times, but only N particles are resampled, sorted and regrouped.
 
-    - `propagate`: the `Propagate` that draws. With its noise "rqmc"
-      the draws of a family fill K strata of the first dimension of the noise, and one more
-      dimension of the same point set says which of them is kept. So what is kept is spread over
-      slot and noise as well.
+    - `propagate`: the `Propagate` that draws. With its noise "rqmc" all K N draws are one point
+      set, of which the draws of a particle are neighbours.
     - `num_draws`: K.
 
     Raises `ValueError` for K < 1, and for gradient "stop", which does not see which draw was
@@ -53,7 +50,11 @@ class PropagateNested(AbstractPropagationOfEach, AbstractWrapper):
             # Without an observation all draws of a particle have the same weight.
             return self.propagate(key, mixture, now)
         n, k = mixture.num_particles, self.num_draws
-        families, shares = self._drawn(key, mixture, now)
+        key_draws, key_kept = split(key, 2)
+        repeated = mixture.repeated(k)
+        repeated = repeated.replace(log_weights=repeated.log_weights - math.log(k))
+        families = self.propagate(key_draws, repeated, now)
+        shares = uniform(key_kept, (n,), mixture.log_weights.dtype)
         log_weights = families.log_weights.reshape(n, k)
         largest = jnp.max(log_weights, axis=1, keepdims=True)
         largest = jnp.where(largest > -jnp.inf, largest, 0.0)
@@ -68,21 +69,3 @@ class PropagateNested(AbstractPropagationOfEach, AbstractWrapper):
             log_weights=largest[:, 0] + jnp.log(jnp.sum(weights, axis=1)),
             log_scale=families.log_scale,
         )
-
-    def _drawn(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step
-    ) -> tuple[ParticleMixture, Float[Array, " n"]]:
-        """The weighed mixture of all draws, and the uniform numbers by which draws are selected."""
-        n, k, propagate = mixture.num_particles, self.num_draws, self.propagate
-        repeated = mixture.repeated(k)
-        repeated = repeated.replace(log_weights=repeated.log_weights - math.log(k))
-        if propagate.noise == "independent":
-            key_draws, key_kept = split(key, 2)
-            shares = uniform(key_kept, (n,), mixture.log_weights.dtype)
-            return propagate(key_draws, repeated, now), shares
-        shape, dtype = (n, propagate.noise_dimension(mixture, now)), noise_dtype(mixture.particles)
-        noise, shares = draw_family_noise(
-            key, shape, k, dtype,
-            mixture.component_indicators, mixture.num_components, not mixture.in_order,
-        )  # fmt: skip
-        return propagate.from_noise(noise, repeated, now), shares

@@ -66,41 +66,17 @@ class _Propagation(AbstractPropagation):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t; without it, by the model's own law."""
-        if is_missing(now):
-            return predict(key, now.model, mixture, self.gradient, self.noise)
-        if self.noise != "independent":
-            dimension = self.noise_dimension(mixture, now)
-            noise = noise_of_slots(key, self.noise, dimension, mixture)
-            return self.from_noise(noise, mixture, now)
-        if self.proposal is None:
-            return self.weighed(predict(key, now.model, mixture, self.gradient), now)
-        return self._proposed(self.proposal.propose(key, now, mixture.particles), mixture, now)
-
-    def from_noise(
-        self, noise: Float[Array, "n k"], mixture: ParticleMixture, now: Step
-    ) -> ParticleMixture:
-        """The same with x_t made of this noise, a row for each slot."""
-        if self.proposal is None:
-            draws = made_of(now.model, noise, mixture.particles)
-            return self.weighed(_moved(draws, now.model, mixture, self.gradient), now)
-        proposal: Any = self.proposal
-        return self._proposed(
-            proposal.propose_from_noise(noise, now, mixture.particles), mixture, now
-        )
-
-    def noise_dimension(self, mixture: ParticleMixture, now: Step) -> int:
-        """k, the number of standard normal numbers that x_t is made of."""
-        proposal: Any = self.proposal
-        if proposal is None:
-            return noise_dimension(now.model, mixture.particles)
-        return proposal.noise_dimension(mixture.particles)
-
-    def _proposed(
-        self, proposed: tuple[PyTree, Float[Array, " n"]], mixture: ParticleMixture, now: Step
-    ) -> ParticleMixture:
-        """The mixture of the proposal's draws, with the log density of each."""
-        (draws, log_density), previous = proposed, mixture.particles
-        check_moved(draws, drawn_part(now.model, previous), self.proposal, "propose")
+        proposal, previous = self.proposal, mixture.particles
+        if proposal is None or is_missing(now):
+            moved = predict(key, now.model, mixture, self.gradient, self.noise)
+            return moved if is_missing(now) else self.weighed(moved, now)
+        if self.noise == "independent":
+            draws, log_density = proposal.propose(key, now, previous)
+        else:
+            of_noise: Any = proposal
+            noise = noise_of_slots(key, self.noise, of_noise.noise_dimension(previous), mixture)
+            draws, log_density = of_noise.propose_from_noise(noise, now, previous)
+        check_moved(draws, drawn_part(now.model, previous), proposal, "propose")
         if self.gradient == "stop":
             draws, log_density = without_gradient((draws, log_density))
         moved = mixture.replace(particles=completed(now.model, draws, previous))
