@@ -161,7 +161,7 @@ def in_line(
         return order, jnp.where(in_turn < m, take(log_weights, order), -jnp.inf), in_turn
 
     def by_component() -> tuple[Array, Array, Array]:
-        return in_order(order_by_segment(labels, m)[0])
+        return in_order(order_by_segment(labels, m))
 
     def as_they_are() -> tuple[Array, Array, Array]:
         return jnp.arange(labels.shape[0], dtype=jnp.int32), log_weights, labels

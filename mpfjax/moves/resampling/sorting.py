@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, Shaped, UInt32
 
 from mpfjax.operations.prefix_sums import count_upto
-from mpfjax.operations.segments import segment_counts
 from mpfjax.operations.stored import (
     EXACT_IN_FLOAT32,
     count_places,
@@ -27,10 +26,8 @@ _BITS = 32
 MOST_DIMENSIONS = 8
 
 
-def order_by_segment(
-    segments: Int[Array, " n"], num_segments: int
-) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
-    """The indices that make segments contiguous and ascending, and how many each segment has.
+def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " n"]:
+    """The indices that make segments contiguous and ascending.
 
     Within a segment the original order stays; a label equal to `num_segments` comes last. For up to
     a few hundred segments the place of each entry is counted, in O(n). For more, label and index
@@ -39,19 +36,15 @@ def order_by_segment(
     """
     n = segments.shape[0]
     if num_segments <= _MOST_COUNTED_SEGMENTS and n < EXACT_IN_FLOAT32:
-        places, counts = _places_by_segment(segments, num_segments)
-        return inverse_permutation(places), counts
-    counts = segment_counts(jnp.ones(n, bool), segments, num_segments)
+        return inverse_permutation(_places_by_segment(segments, num_segments))
     if (num_segments + 1) * n >= 2**31:
-        return jnp.argsort(segments, stable=True).astype(jnp.int32), counts
+        return jnp.argsort(segments, stable=True).astype(jnp.int32)
     index = jnp.arange(n, dtype=jnp.int32)
-    return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n, counts
+    return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n
 
 
-def _places_by_segment(
-    segments: Int[Array, " n"], num_segments: int
-) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
-    """Each entry's place in the order, which is how many come before it, and segments' counts.
+def _places_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " n"]:
+    """Each entry's place in the order, which is how many come before it.
 
     A table has a row for each segment and a column for each block of entries; a cell counts the
     block's entries of that segment. The prefix sum over the whole table, row after row, is the
@@ -71,8 +64,7 @@ def _places_by_segment(
     for back in range(1, _COUNTED_BLOCK):
         earlier = jax.lax.slice_in_dim(line, _COUNTED_BLOCK - back, _COUNTED_BLOCK - back + n)
         ranks = ranks + (earlier == cells).astype(jnp.int32)
-    firsts = before[: (num_segments + 1) * num_blocks : num_blocks]
-    return take(before, cells) + ranks, jnp.diff(firsts)
+    return take(before, cells) + ranks
 
 
 def order_by_key(
