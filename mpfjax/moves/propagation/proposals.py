@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -40,8 +40,26 @@ class AbstractProposal(Given):
         """
 
 
+class _Gaussian(NamedTuple):
+    """N(mean, F Fᵀ) of every particle."""
+
+    means: Float[Array, "n d"]
+    log_volumes: Float[Array, " n"]  # log |F|
+    forth: Callable[[Array], Array]  # from z to F z
+    back: Callable[[Array], Array]
+
+    def log_density(self, noise: Float[Array, "n d"]) -> Float[Array, " n"]:
+        """That of mean + F z, for the noise z."""
+        log_unit = 0.5 * noise.shape[1] * math.log(2 * math.pi)
+        return -0.5 * jnp.sum(noise**2, axis=1) - log_unit - self.log_volumes
+
+
 class _GaussianProposal(AbstractProposal):
     """A proposal whose draw is made of as many normal numbers as the state has."""
+
+    @abc.abstractmethod
+    def _law(self, now: Step, previous_states: Float[Array, "n ..."]) -> _Gaussian:
+        """q of every particle."""
 
     def propose(
         self, key: Key[Array, ""], now: Step, previous_states: Float[Array, "n ..."]
@@ -55,11 +73,20 @@ class _GaussianProposal(AbstractProposal):
         """d."""
         return math.prod(previous_states.shape[1:])
 
-    @abc.abstractmethod
     def propose_from_noise(
-        self, noise: Float[Array, "n d"], now: Step, previous_states: PyTree
-    ) -> tuple[PyTree, Float[Array, " n"]]:
+        self, noise: Float[Array, "n d"], now: Step, previous_states: Float[Array, "n ..."]
+    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """The same, made of this noise."""
+        law = self._law(now, previous_states)
+        states = (law.means + law.forth(noise)).reshape(previous_states.shape)
+        return states, law.log_density(noise)
+
+    def log_density(
+        self, now: Step, states: Float[Array, "n ..."], previous_states: Float[Array, "n ..."]
+    ) -> Float[Array, " n"]:
+        """log q(x_t | x_{t-1}, y_t) of every particle."""
+        law = self._law(now, previous_states)
+        return law.log_density(law.back(states.reshape(law.means.shape) - law.means))
 
 
 class NetworkProposal(_GaussianProposal):
@@ -101,38 +128,20 @@ class NetworkProposal(_GaussianProposal):
         last = jax.tree.map(lambda leaf: 0.1 * leaf, network.layers[-1])
         return cls(eqx.tree_at(lambda net: net.layers[-1], network, last), scale)
 
-    def propose_from_noise(
-        self,
-        noise: Float[Array, "n d"],
-        now: Step,
-        previous_states: Float[Array, "n ..."],
-    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
-        """The same, made of this noise."""
-        means, deviations = self._moments(now, previous_states)
-        states = means + deviations * noise
-        return states.reshape(previous_states.shape), _log_standard(noise, deviations)
-
-    def log_density(
-        self,
-        now: Step,
-        states: Float[Array, "n ..."],
-        previous_states: Float[Array, "n ..."],
-    ) -> Float[Array, " n"]:
-        """log q(x_t | x_{t-1}, y_t) of every particle."""
-        means, deviations = self._moments(now, previous_states)
-        return _log_standard((states.reshape(means.shape) - means) / deviations, deviations)
-
-    def _moments(
-        self, now: Step, previous_states: Float[Array, "n ..."]
-    ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
-        """The mean and deviations of every particle's Gaussian."""
+    def _law(self, now: Step, previous_states: Float[Array, "n ..."]) -> _Gaussian:
         previous = previous_states.reshape(previous_states.shape[0], -1)
         seen = ravel_pytree(now.observation)[0].astype(previous.dtype)
         rows = jnp.broadcast_to(seen, (previous.shape[0], seen.shape[0]))
         outputs = jax.vmap(self.network)(jnp.concatenate([previous, rows], axis=1))
         shifts, log_widths = jnp.split(outputs, 2, axis=1)
         scale = jnp.broadcast_to(self.scale.astype(previous.dtype), previous.shape)
-        return previous + scale * shifts, scale * jnp.exp(log_widths)
+        deviations = scale * jnp.exp(log_widths)
+        return _Gaussian(
+            means=previous + scale * shifts,
+            log_volumes=jnp.sum(jnp.log(deviations), axis=1),
+            forth=lambda noise: deviations * noise,
+            back=lambda gaps: gaps / deviations,
+        )
 
 
 class GaussNewtonProposal(_GaussianProposal):
@@ -161,35 +170,15 @@ class GaussNewtonProposal(_GaussianProposal):
         for mean in ("transition_mean", "observation_mean"):
             require(now.model, mean, "GaussNewtonProposal")
 
-    def propose_from_noise(
-        self,
-        noise: Float[Array, "n d"],
-        now: Step,
-        previous_states: Float[Array, "n ..."],
-    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
-        """The same, made of this noise."""
-        prior_means, means, factors = self._fit(now, previous_states)
-        states = means + self.inflation * _solve_transposed(factors, noise)
-        return states.reshape(prior_means.shape), self._log_density(noise, factors)
-
-    def log_density(
-        self,
-        now: Step,
-        states: Float[Array, "n ..."],
-        previous_states: Float[Array, "n ..."],
-    ) -> Float[Array, " n"]:
-        """log q(x_t | x_{t-1}, y_t) of every particle."""
-        _, means, factors = self._fit(now, previous_states)
-        residuals = (states.reshape(means.shape) - means) / self.inflation
-        return self._log_density(jnp.einsum("nij,ni->nj", factors, residuals), factors)
-
-    def _log_density(
-        self, noise: Float[Array, "n d"], factors: Float[Array, "n d d"]
-    ) -> Float[Array, " n"]:
-        """log q of draws that were made of this noise."""
-        log_scale = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
-        log_unit = noise.shape[1] * (jnp.log(self.inflation) + 0.5 * jnp.log(2 * jnp.pi))
-        return (log_scale - log_unit - 0.5 * jnp.sum(noise**2, axis=1)).astype(noise.dtype)
+    def _law(self, now: Step, previous_states: Float[Array, "n ..."]) -> _Gaussian:
+        means, factors = self._fit(now, previous_states)
+        log_scale = means.shape[1] * math.log(self.inflation)
+        return _Gaussian(
+            means,
+            log_volumes=log_scale - _log_diagonal(factors),
+            forth=lambda noise: self.inflation * _solve_transposed(factors, noise),
+            back=lambda gaps: jnp.einsum("nij,ni->nj", factors, gaps) / self.inflation,
+        )
 
     def log_normaliser(
         self, now: Step, previous_states: Float[Array, "n ..."]
@@ -201,20 +190,19 @@ class GaussNewtonProposal(_GaussianProposal):
         `LinearGaussianModel`. It does not depend on the inflation. Use it as the look-ahead of
         `AuxiliaryResample`.
         """
-        prior_means, means, factors = self._fit(now, previous_states)
-        states = means.reshape(prior_means.shape)
+        means, factors = self._fit(now, previous_states)
+        states = means.reshape(previous_states.shape)
         log_densities = likelihoods(now.model, now.observation, states)
         log_densities += log_transition(now.model, states, previous_states)
-        log_precision = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
-        return log_densities + 0.5 * means.shape[1] * jnp.log(2 * jnp.pi) - log_precision
+        return log_densities + 0.5 * means.shape[1] * math.log(2 * math.pi) - _log_diagonal(factors)
 
     def _fit(
         self, now: Step, previous_states: Float[Array, "n ..."]
-    ) -> tuple[Float[Array, "n ..."], Float[Array, "n d"], Float[Array, "n d d"]]:
-        """The means of D, those of q, and the Cholesky factors of the precisions Λ."""
+    ) -> tuple[Float[Array, "n d"], Float[Array, "n d d"]]:
+        """The means of q, and the Cholesky factors of the precisions Λ."""
         model: Any = now.model
-        prior_means = model.transition_mean(previous_states)
-        prior, state_shape = prior_means.reshape(len(prior_means), -1), prior_means.shape[1:]
+        prior, state_shape = model.transition_mean(previous_states), previous_states.shape[1:]
+        prior = prior.reshape(len(prior), -1)
         target = jnp.atleast_1d(now.observation).astype(prior.dtype)
         prior_precision = _inverse(_matrix(model.transition_covariance)).astype(prior.dtype)
         precision_y = _inverse(_matrix(model.observation_covariance)).astype(prior.dtype)
@@ -233,15 +221,12 @@ class GaussNewtonProposal(_GaussianProposal):
             information = prior @ prior_precision + jnp.einsum("ndq,nq->nd", gains, residuals)
             factors = cholesky(precisions)
             means = _solve_transposed(factors, solve_lower(factors, information))
-        return prior_means, means, factors
+        return means, factors
 
 
-def _log_standard(
-    noise: Float[Array, "n d"], deviations: Float[Array, "n d"]
-) -> Float[Array, " n"]:
-    """The log density of mean + deviations * noise, for standard normal noise."""
-    log_widths = jnp.log(deviations) + 0.5 * jnp.log(2 * jnp.pi)
-    return -jnp.sum(0.5 * noise**2 + log_widths, axis=1)
+def _log_diagonal(factors: Float[Array, "n d d"]) -> Float[Array, " n"]:
+    """log |F|."""
+    return jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
 
 
 def _solve_transposed(
