@@ -152,28 +152,21 @@ def over_threads(
 
     It is for programs of many short operations, which a CPU device runs mostly one after the other.
     The blocks have equal size: the last input is repeated to fill the last block, and the extra
-    results are dropped. This thread takes the first block. It takes all of them if other threads
-    would not have its settings of JAX, or a transformation of the caller. The operations of a block
-    use one thread if there is a block for each processor, and otherwise all.
+    results are dropped. This thread takes all of them if others would not have its settings of JAX,
+    or a transformation of the caller. The operations of a block use one thread if there is a block
+    for each processor, and otherwise all.
     """
     num_inputs = length_of(inputs)
     size = -(-num_inputs // num_threads)
     starts = range(0, num_inputs, size)
     program = _run_block_on_one if len(starts) >= num_processors() else _run_block
-    seen = _seen_by_thread()
 
     def run_block(first: int) -> PyTree:
-        if _seen_by_thread() == seen:
-            block = program(run, np.asarray(first), size, inputs, arguments)
-            return jax.block_until_ready(block)
+        return jax.block_until_ready(program(run, np.asarray(first), size, inputs, arguments))
 
-    first, *others = starts
-    started = [_threads().submit(run_block, other) for other in others]
-    blocks = [run_block(first)]
-    for other, thread in zip(others, started, strict=True):
-        block = thread.result()
-        blocks.append(run_block(other) if block is None else block)
-    return _end_to_end(blocks, num_inputs)
+    are_alike = _threads().submit(_seen_by_thread).result() == _seen_by_thread()
+    blocks = (_threads().map if are_alike else map)(run_block, starts)
+    return _end_to_end(list(blocks), num_inputs)
 
 
 def _block_of_runs(run, first, size, inputs, arguments):
