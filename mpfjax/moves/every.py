@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Key, PyTree
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import (
-    AbstractRegrouping,
     AbstractWrapper,
     Moves,
     Step,
@@ -79,15 +78,4 @@ class Every(AbstractWrapper):
                 moved = move(move_key, moved, now)  # pyright: ignore[reportArgumentType]
             return moved.replace(in_order=False)  # it is so at every k-th step alone
 
-        if not all(isinstance(move, AbstractRegrouping) for move in self.moves):
-            return jax.lax.cond(runs, run, lambda: mixture)
-
-        # Only what they may change goes through the condition, which copies its operands.
-        def regroup() -> tuple[Array, dict[str, PyTree]]:
-            moved = run()
-            return moved.component_indicators, moved.memory
-
-        indicators, memory = jax.lax.cond(
-            runs, regroup, lambda: (mixture.component_indicators, mixture.memory)
-        )
-        return mixture.replace(component_indicators=indicators, memory=memory)
+        return jax.lax.cond(runs, run, lambda: mixture)

@@ -24,7 +24,6 @@ from mpfjax.operations.logarithms import (
     default_float,
     exp,
     finite_or_zero,
-    largest,
 )
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import stored, take, whole
@@ -193,7 +192,7 @@ def trusted(log_factors: Float[Array, "2 n"], weights: Float[Array, " n"]) -> Fl
     first, second = (
         jnp.where((weights > 0) & (draw < jnp.inf), draw, -jnp.inf) for draw in log_factors
     )
-    highest = finite_or_zero(jnp.maximum(largest(first), largest(second)))
+    highest = finite_or_zero(jnp.max(jnp.maximum(first, second)))
     # Stored, so that the exponentials are taken on vectors, and once.
     first, second = (stored(exp(draw - highest)) for draw in (first, second))
     # All sums in one product: each one alone would be a kernel. Where the likelihoods are so much

@@ -11,9 +11,7 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Inexact, Int, PyTree, Shaped
-
-_INTEGERS = {2: jnp.int16, 4: jnp.int32, 8: jnp.int64}
+from jaxtyping import Array, Float, Inexact, PyTree, Shaped
 
 
 def as_inexact(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:
@@ -50,29 +48,6 @@ def without_gradient(tree: PyTree) -> PyTree:
     )
 
 
-def largest(values: Shaped[Array, "..."], axis: int | None = None) -> Shaped[Array, "..."]:
-    """The largest value, over all or along an axis: -inf of none, NaN where there is one.
-
-    Whole numbers have the largest one, too; there must be one. A derivative treats the largest as
-    a constant.
-    """
-    if not jnp.issubdtype(values.dtype, jnp.floating):
-        return jnp.max(values, axis=axis)
-    kind = _INTEGERS[values.dtype.itemsize]
-    info = jnp.iinfo(kind)
-
-    def mirrored(bits: Int[Array, "..."]) -> Int[Array, "..."]:
-        # Those with a sign have their other bits inverted: the order of the values, and back.
-        return bits ^ ((bits >> (info.bits - 1)) & info.max)
-
-    least = mirrored(jax.lax.bitcast_convert_type(jnp.array(-jnp.inf, values.dtype), kind))
-    keys = mirrored(jax.lax.bitcast_convert_type(values, kind))
-    # Of all integers, the last one is NaN.
-    keys = jnp.where(jnp.isnan(values), info.max, keys)
-    most = jnp.max(keys, axis=axis, initial=least)
-    return jax.lax.bitcast_convert_type(mirrored(most), values.dtype)
-
-
 def exp(log_values: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
     """e to these powers; zero where it is too small to count beside 1, even squared or summed.
 
@@ -98,7 +73,7 @@ def finite_max(log_values: Float[Array, " n"]) -> Float[Array, ""]:
 
     A derivative treats it as a constant.
     """
-    most = largest(log_values)
+    most = jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf)
     return jnp.where(jnp.isfinite(most), most, 0.0)
 
 

@@ -8,7 +8,6 @@ long sums stay small.
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +18,11 @@ from mpfjax.operations.logarithms import (
     default_float,
     exp,
     finite_or_zero,
-    largest,
     log_or_nothing,
 )
 from mpfjax.operations.prefix_sums import count_starts
 from mpfjax.operations.stored import (
     EXACT_IN_FLOAT32,
-    block_size,
     stored,
     take,
 )
@@ -47,7 +44,7 @@ _LONGEST_SUM = 2**10
 # The segments that occur are kept in the bits of at most this many words.
 _WORD, _MOST_WORDS = 32, 8
 _WORD_BITS = 5  # a word has 2^5 bits
-_REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": largest, "min": jnp.min}
+_REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
 
 
 @jax.jit
@@ -260,41 +257,3 @@ def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, "
     for m in range(1, num_segments):
         segments = segments + (place >= firsts[m]).astype(jnp.int32)
     return segments
-
-
-class SideBySide(NamedTuple):
-    """Segments whose entries are neighbours: whole blocks of entries, and where segments end.
-
-    Most blocks lie in one segment, so that blocks are summed before segments are.
-    """
-
-    labels: Int[Array, "blocks size"]
-    ends: Int[Array, "2 m"]  # each segment's first and last block
-
-    def reduce(self, how: str, values: Shaped[Array, " p"], nothing: float) -> Shaped[Array, " m"]:
-        """As `segment_reduce`."""
-        m, reduced = self.ends.shape[1], _REDUCTIONS[how]
-        if are_masked(len(values), m):
-            return segment_reduce(how, values, self.labels.reshape(-1), m, nothing)
-        blocks = values.reshape(self.labels.shape)
-        is_whole = self.labels[:, 0] == self.labels[:, -1]
-        labels = jnp.where(is_whole, self.labels[:, 0], m)
-        inner = segment_reduce(how, reduced(blocks, axis=1), labels, m, nothing)
-        ends = self.ends.reshape(-1)
-        # A segment that lies in one block has it twice.
-        counts = jnp.concatenate([jnp.ones(m, bool), self.ends[0] < self.ends[1]])
-        label = jnp.tile(jnp.arange(m, dtype=labels.dtype), 2)
-        is_member = take(self.labels, ends) == label[:, None]
-        is_member &= (counts & ~take(is_whole, ends))[:, None]
-        outer = jnp.where(is_member, take(blocks, ends), nothing).astype(values.dtype)
-        return reduced(jnp.stack([inner, *reduced(outer, axis=1).reshape(2, m)]), axis=0)
-
-
-def side_by_side(labels: Int[Array, " p"], num_segments: int) -> SideBySide:
-    """Segments by labels in ascending order, which fill whole blocks; the label M is in none."""
-    blocks = labels.reshape(-1, block_size(labels.shape[0]))
-    label, last = jnp.arange(num_segments, dtype=labels.dtype)[None], len(blocks) - 1
-    before = jnp.sum((blocks[:, -1:] < label).astype(jnp.int32), axis=0)
-    after = jnp.sum((blocks[:, :1] > label).astype(jnp.int32), axis=0)
-    ends = jnp.stack([jnp.minimum(before, last), jnp.maximum(last - after, 0)])
-    return SideBySide(blocks, stored(ends))

@@ -76,7 +76,7 @@ def draw_ancestors(
     if keep is not None:
         key, key_kept = split(key, 2)
         place, component = keep, jnp.zeros((), jnp.int32)
-        if line.order is not None and line.components is not None:
+        if line.order is not None and line.labels is not None:
             place = jnp.argmax(line.order == keep).astype(jnp.int32)
             component = line.components[place]
         kept = Kept(place, component, uniform(key_kept, (2,), expected.dtype))

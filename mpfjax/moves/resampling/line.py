@@ -34,10 +34,9 @@ from mpfjax.operations.prefix_sums import (
     unit_bits,
 )
 from mpfjax.operations.segments import (
-    SideBySide,
     column_sums,
     segment_counts,
-    side_by_side,
+    segment_reduce,
     spread,
 )
 from mpfjax.operations.stored import cond_if_any, stored, take, to_int, whole
@@ -51,7 +50,7 @@ class Line(NamedTuple):
     """The particles in a line of p places, those of a component side by side.
 
     p is a multiple of the block length of the prefix sums. The particles of a single component
-    that nothing sorts stand where they are: `order`, `components` and `segments` are then None.
+    that nothing sorts stand where they are: `order` and `labels` are then None.
     """
 
     num_particles: int
@@ -60,13 +59,18 @@ class Line(NamedTuple):
     log_units: Float[Array, " m"]
     is_drawn: Bool[Array, " p"]  # at which places a particle may be drawn, or stays as it is
     order: Int[Array, " p"] | None = None  # which particle stands at each place
-    components: Int[Array, " p"] | None = None
-    segments: SideBySide | None = None  # of the components; an empty place is in none
+    labels: Int[Array, " p"] | None = None  # the component of each place, M where it is empty
+
+    @property
+    def components(self) -> Int[Array, " p"]:
+        """The component of each place, any where it is empty."""
+        assert self.labels is not None
+        return jnp.minimum(self.labels, self.totals.shape[0] - 1)
 
     @property
     def counts(self) -> Int[Array, " m"]:
         """How many places each component has."""
-        if self.components is None:
+        if self.labels is None:
             return jnp.full(1, self.num_particles, jnp.int32)
         return segment_counts(self.is_drawn, self.components, self.totals.shape[0])
 
@@ -83,24 +87,25 @@ class Line(NamedTuple):
 
     def sums(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
         """The sum over each component's places."""
-        if self.segments is None:
+        if self.labels is None:
             return jnp.sum(values, keepdims=True)
-        return self.segments.reduce("add", values, 0.0)
+        return segment_reduce("add", values, self.labels, self.totals.shape[0])
 
     def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, " #p"]:
         """The value of the component at each place."""
-        return values if self.components is None else spread(values, self.components)
+        return values if self.labels is None else spread(values, self.components)
 
     def extents(self, drawn: bool) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
         """The first and the last place of each component: of those `drawn` from, or of all."""
         last = self.weights.shape[0] - 1
-        if self.segments is None:
+        if self.labels is None:
             return jnp.zeros(1, jnp.int32), jnp.full(1, last, jnp.int32)
         places = jnp.arange(last + 1, dtype=jnp.int32)
         # The last place is the least of the negative ones: one minimum finds both.
         signed = jnp.stack([places, -places])
         signed = jnp.where(self.is_drawn, signed, last) if drawn else signed
-        least = partial(self.segments.reduce, "min", nothing=last)
+        num = self.totals.shape[0]
+        least = partial(segment_reduce, "min", segments=self.labels, num_segments=num, nothing=last)
         firsts, lasts = stored(jax.vmap(least)(signed))
         return firsts, jnp.maximum(-lasts, 0)
 
@@ -172,15 +177,13 @@ def in_line(
     else:
         order = sorted_order(mixture, labels[:n], sort_by)
         order, log_weights, labels = in_order(whole(order, labels.shape[0] - 1))
-    segments = side_by_side(labels, m)
-    log_largest = finite_or_zero(segments.reduce("max", log_weights, -jnp.inf))
-    components = jnp.minimum(labels, m - 1)
-    relative = exp(log_weights - spread(log_largest, components))
+    log_largest = finite_or_zero(segment_reduce("max", log_weights, labels, m, -jnp.inf))
+    relative = exp(log_weights - spread(log_largest, jnp.minimum(labels, m - 1)))
     is_drawn = relative > 0
     if stays is not None:
         is_drawn |= (log_weights > -jnp.inf) & take(whole(stays, False), order)
-    totals = segments.reduce("add", relative, 0.0)
-    return Line(n, relative, totals, log_largest, is_drawn, order, components, segments)
+    totals = segment_reduce("add", relative, labels, m)
+    return Line(n, relative, totals, log_largest, is_drawn, order, labels)
 
 
 def sorted_order(
