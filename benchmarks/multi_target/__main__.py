@@ -21,6 +21,7 @@ Into --out DIR go multi_target.json and multi_target.png, the first run of the f
 
 import time
 from collections.abc import Callable, Sequence
+from itertools import cycle, product
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -30,7 +31,7 @@ import numpy as np
 
 import mpfjax
 from benchmarks import harness
-from benchmarks.harness import Count, command
+from benchmarks.harness import AtLeast2, Count, command
 from benchmarks.multi_target import gm_phd, known, stone_soup
 from benchmarks.multi_target.scenes import PLACE, SCENES, Scene, drawn, model_of, told
 
@@ -62,7 +63,7 @@ Run = Callable[[int, tuple[np.ndarray, ...]], Found]
 def main(
     *,
     scenes: Sequence[Annotated[str, (*SCENES,)]] = (*SCENES,),
-    seeds: Count = 20,
+    seeds: AtLeast2 = 20,
     steps: Count = 100,
     particles_per_target: Count = 150,
     peers: bool = False,
@@ -166,8 +167,9 @@ def _means(scores: np.ndarray) -> dict[str, float | None]:
 
 def _picture(truth: np.ndarray, plots: np.ndarray, found: Found) -> Any:
     """Tracks through the plots, and the number over time."""
-    from matplotlib import colormaps
     from matplotlib.figure import Figure
+
+    from mpfjax.plotting import COLOURS
 
     figure = Figure((10, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -177,11 +179,12 @@ def _picture(truth: np.ndarray, plots: np.ndarray, found: Found) -> Any:
         path = there[is_there[:, k], k].T
         left.plot(*path, color="k", linewidth=0.8, zorder=3, label=None if k else "true path")
     labels, steps = np.unique(found.labels[found.is_told]), np.arange(1, len(truth) + 1)
-    colours = colormaps["turbo"](np.linspace(0, 1, len(labels)))
-    for label, colour in zip(labels, colours, strict=True):
+    # More labels than colours: the next ones are hollow.
+    styles = cycle(product(("full", "none"), COLOURS))
+    for k, (label, (filling, colour)) in enumerate(zip(labels, styles, strict=False)):
         own = found.is_told & (found.labels == label)
-        name = "tracks, by label" if label == labels[0] else None
-        left.plot(*found.places[own].T, ".", color=colour, markersize=3, label=name)
+        style: Any = {"color": colour, "fillstyle": filling, "ms": 3, "mew": 0.6}
+        left.plot(*found.places[own].T, "o", **style, label=None if k else "tracks, by label")
     left.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False, markerscale=3)
     left.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
 
