@@ -200,7 +200,7 @@ def draw_dots(rows: Sequence[Sequence[Panel]], width: float) -> Figure:
         axis.set(xlabel=panel.xlabel, xlim=panel.ylim)
         axis.set_title(textwrap.fill(panel.title, int(11 * width)), fontsize=9)
         axis.grid(alpha=0.25)
-    axes[0, 0].invert_yaxis()
+    axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return figure
 

@@ -70,7 +70,7 @@ def _run_case(found: Any, num_particles: int, num_runs: int, seed: int) -> list[
     means = content_of(scenes, rows)["means"]
     of_hard = {(entry["method"], entry["order"]): entry for entry in means["2"]}
     entries = []
-    for easy in means["1"]:
+    for easy in sorted(means["1"], key=lambda entry: list(FILTERS).index(entry["method"])):
         if easy["order"] in (None, "mean"):
             hard = of_hard[easy["method"], easy["order"]]
             recovery = {name: hard[name] for name in ("recovery", "recovery_interval")}
@@ -86,7 +86,7 @@ def draw_sensitivity(entries: Sequence[dict[str, Any]]) -> Any:
     """
     rows = (
         ("recovery", "recovery of object 1", (-0.03, 1.03)),
-        ("precision", "precision of objects 2-7", (0.5, 1.0)),
+        ("precision", "precision of objects 2-7", (-0.03, 1.03)),
     )
     chosen = {axis: value for axis, values in AXES.items() for value, changed in values.items()
               if DEFAULT | changed == DEFAULT}  # fmt: skip
