@@ -1,5 +1,6 @@
 """Standard normal and uniform draws: independent, or spread evenly over particles."""
 
+import math
 from typing import Literal
 
 import equinox as eqx
@@ -11,7 +12,6 @@ from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import (
     bits,
     normal,
-    normal_quantile,
     scrambled_directions,
     shuffled,
     sobol_points,
@@ -93,7 +93,7 @@ def _num_digits(num_ranks: int) -> int:
 
 def normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
     """Quantiles of the standard normal at points in units of 2^-32."""
-    return normal_quantile(2 * uniform_of(points, dtype) - 1)
+    return math.sqrt(2) * jax.lax.erf_inv(2 * uniform_of(points, dtype) - 1)
 
 
 def uniform_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
