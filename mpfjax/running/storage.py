@@ -3,15 +3,12 @@
 A file is written whole or not at all, and loads without running code.
 """
 
-import contextlib
 import dataclasses
-import glob
 import hashlib
 import json
 import os
 import re
 import secrets
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -24,7 +21,6 @@ from jaxtyping import PyTree
 
 _MOST_SHOWN = 4
 _DESCRIPTION = "description"
-_DAY = 24 * 60 * 60
 
 
 def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
@@ -239,7 +235,6 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
     path.parent.mkdir(parents=True, exist_ok=True)
     # Writers that shared a name would write into each other's file, and take it from each other.
     partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
-    _remove_what_the_killed_left(path)
     try:
         with open(partial, "xb") as file:
             write(file)
@@ -253,14 +248,6 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
             fault = f"{error.strerror or error}; nothing that was written before is lost"
             raise OSError(error.errno, fault, str(path)) from error
         raise
-
-
-def _remove_what_the_killed_left(path: Path) -> None:
-    """Remove what writers of this path left unfinished, a day ago or longer."""
-    for other in path.parent.glob(f"{glob.escape(path.name)}.*.partial"):
-        with contextlib.suppress(OSError):
-            if other.stat().st_mtime < time.time() - _DAY:
-                other.unlink()
 
 
 def write_described(

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -149,16 +148,6 @@ class TestFiles:
         with ThreadPoolExecutor(len(states)) as writers:
             list(writers.map(write_and_read, states))
         assert list(path.parent.iterdir()) == [path]
-
-    def test_what_a_killed_writer_left_goes_a_day_later(self, path):
-        mpfjax.save_checkpoint(path, MIXTURE)
-        ages = {"0a.partial": 2 * 86400, "0b.partial": 60}
-        for name, age in ages.items():
-            other = path.with_name(f"{path.name}.{name}")
-            other.write_text("half")
-            os.utime(other, (time.time() - age,) * 2)
-        mpfjax.save_checkpoint(path, MIXTURE)
-        assert sorted(os.listdir(path.parent)) == [path.name, f"{path.name}.0b.partial"]
 
     def test_no_code_in_a_file_is_run_and_none_is_written(self, path, tmp_path):
         trace = tmp_path / "it ran"
