@@ -22,13 +22,11 @@ from mpfjax.operations.stored import (
     count_places,
     on_platform,
     stored,
-    to_int,
     whole,
     whole_blocks,
 )
 
 _ONE_BLOCK = 128
-_FEWEST, _FEW = 16, 64
 # A sum in float32 of more numbers than these has too few bits for the fraction. The limit is a
 # number of particles, which is static: filters below it have the draws that they always had.
 MOST_IN_ONE_FLOAT = 100_000
@@ -96,22 +94,7 @@ def _blocked_count_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
     is_first = jnp.arange(size) == 0
     blocks = blocks + jnp.where(is_first[None], before[:, None], 0.0)
     upto = blocks @ jnp.triu(jnp.ones((size, size), blocks.dtype))
-    return to_int(upto).reshape(-1)[:n]
-
-
-def few_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
-    """`jnp.cumsum` of whole numbers or booleans that are few, such as one for each component.
-
-    It compiles as one kernel of masked sums, where XLA's takes up to seven.
-    """
-    n = values.shape[0]
-    if n > _FEW:
-        return jnp.cumsum(values, dtype=jnp.int32)
-    place = jnp.arange(n, dtype=jnp.int32)
-    counts = values.astype(jnp.int32)
-    # Over the first axis the sums run on vectors, but XLA repeats them for every use.
-    sums = jnp.sum(jnp.where(place[:, None] <= place[None], counts[:, None], 0), 0, jnp.int32)
-    return sums if n <= _FEWEST else stored(sums)
+    return upto.astype(jnp.int32).reshape(-1)[:n]
 
 
 def count_starts(starts: Int[Array, " n"], num_slots: int) -> Int[Array, " num_slots"]:

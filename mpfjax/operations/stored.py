@@ -15,11 +15,10 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.core import Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Int, Key, PyTree, Shaped
 
 _only_the_default_forms = False  # set by tests, which try them without a GPU
 VECTOR = 32
@@ -90,20 +89,6 @@ def _same(values: Array) -> Array:
     return values
 
 
-def to_int(
-    values: Float[Array, "*shape"], bound: int = EXACT_IN_FLOAT32 - 1
-) -> Int[Array, "*shape"]:
-    """Whole numbers from 0 to `bound` as integers.
-
-    Added to 2^23 as floats, numbers below 2^23 are in the lowest bits. XLA's own conversion takes
-    several times as long on a CPU, since it checks for NaN and for numbers out of range.
-    """
-    if values.dtype != jnp.float32 or bound >= EXACT_IN_FLOAT32:
-        return values.astype(jnp.int32)
-    shift = np.float32(2**23)
-    return jax.lax.bitcast_convert_type(values + shift, jnp.int32) - shift.view(np.int32)
-
-
 def take(values: Array, indices: Int[Array, " n"]) -> Array:
     """values[indices] for indices that are known to lie in range.
 
@@ -118,13 +103,6 @@ def count_places(
     """How many of the entries name each place, all of which must be in [0, num_places)."""
     counts = jnp.zeros(num_places, dtype).at[places.astype(jnp.uint32)]
     return counts.add(1, mode="promise_in_bounds")
-
-
-def inverse_permutation(places: Int[Array, " n"]) -> Int[Array, " n"]:
-    """The index at each place, given every index's place."""
-    index = jnp.arange(places.shape[0], dtype=jnp.int32)
-    inverse = jnp.zeros_like(index).at[stored(places).astype(jnp.uint32)]
-    return inverse.set(index, mode="promise_in_bounds", unique_indices=True)
 
 
 def cond_if_any(

@@ -19,7 +19,6 @@ from mpfjax.moves.regrouping.features import (
 )
 from mpfjax.operations.logarithms import without_gradient
 from mpfjax.operations.matrices import row_sums
-from mpfjax.operations.prefix_sums import few_upto
 from mpfjax.operations.segments import segment_argmax, spread
 from mpfjax.operations.stored import VECTOR, cond_if_any, stored, take
 
@@ -151,7 +150,7 @@ def free_labels(
     ties = (priority[:, None] == priority[None]) & earlier
     goes_first = wanted[:, None] & ((priority[:, None] > priority[None]) | ties)
     rank = jnp.sum(goes_first, axis=0, dtype=jnp.int32)
-    free_rank = few_upto(~active) - 1
+    free_rank = jnp.cumsum(~active, dtype=jnp.int32) - 1
     matches = ~active[None] & (rank[:, None] == free_rank[None])
     label = jnp.max(jnp.where(matches, component[None], -1), axis=1)
     return jnp.where(wanted & (label >= 0), label, component)

@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float, Int
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.regrouping.features import component_groups
 from mpfjax.operations.logarithms import scaled_exp
-from mpfjax.operations.prefix_sums import few_upto
 from mpfjax.operations.segments import segments_in_order, spread
 from mpfjax.operations.stored import stored
 
@@ -52,7 +51,7 @@ def allocate_slots(
     if demands is None:
         # One more for the first ones if it does not divide evenly.
         share = jax.lax.div(pool, sharers)  # neither is negative
-        share += (few_upto(due) - 1 < pool - share * sharers).astype(jnp.int32)
+        share += (jnp.cumsum(due, dtype=jnp.int32) - 1 < pool - share * sharers).astype(jnp.int32)
     else:
         first = jnp.minimum(pool // sharers, 1)
         share = first + _in_proportion(pool - first * sharers, due, demands)
@@ -116,14 +115,14 @@ def _in_proportion(
     parts = jnp.cumsum(asked) / jnp.maximum(jnp.sum(asked), jnp.finfo(asked.dtype).tiny)
     ends = jnp.round(parts * pool.astype(asked.dtype)).astype(jnp.int32)
     # Despite rounding all slots are given, and none to a component that is not due.
-    still_due = few_upto(due[::-1])[::-1] - due.astype(jnp.int32)
+    still_due = jnp.cumsum(due[::-1], dtype=jnp.int32)[::-1] - due.astype(jnp.int32)
     ends = jnp.where(still_due > 0, jnp.minimum(ends, pool), pool)
     return jnp.diff(ends, prepend=0)
 
 
 def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
     """The slots of each component, given their number for each."""
-    firsts = few_upto(targets) - targets
+    firsts = jnp.cumsum(targets, dtype=jnp.int32) - targets
     slot = jnp.arange(num_particles, dtype=jnp.int32)
     components = segments_in_order(firsts, num_particles)
     return Slots(

@@ -39,7 +39,7 @@ from mpfjax.operations.segments import (
     segment_reduce,
     spread,
 )
-from mpfjax.operations.stored import cond_if_any, stored, take, to_int, whole
+from mpfjax.operations.stored import cond_if_any, stored, take, whole
 
 HILBERT = "hilbert"
 SortBy = Callable[[PyTree], Array] | Literal["hilbert"]
@@ -134,7 +134,7 @@ class Line(NamedTuple):
             return Positions.of_units(places, num_bits, dtype), before < upto[-1]
         before, total = sum_before(values)
         whole_parts = jnp.floor(before)
-        positions = Positions(to_int(whole_parts, len(before)), before - whole_parts)
+        positions = Positions(whole_parts.astype(jnp.int32), before - whole_parts)
         return positions, before < total
 
 

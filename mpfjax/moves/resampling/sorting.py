@@ -14,7 +14,6 @@ from mpfjax.operations.prefix_sums import count_upto
 from mpfjax.operations.stored import (
     EXACT_IN_FLOAT32,
     count_places,
-    inverse_permutation,
     stored,
     take,
     whole_blocks,
@@ -35,11 +34,11 @@ def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array
     sorting pairs.
     """
     n = segments.shape[0]
+    index = jnp.arange(n, dtype=jnp.int32)
     if num_segments <= _MOST_COUNTED_SEGMENTS and n < EXACT_IN_FLOAT32:
-        return inverse_permutation(_places_by_segment(segments, num_segments))
+        return jnp.zeros_like(index).at[_places_by_segment(segments, num_segments)].set(index)
     if (num_segments + 1) * n >= 2**31:
         return jnp.argsort(segments, stable=True).astype(jnp.int32)
-    index = jnp.arange(n, dtype=jnp.int32)
     return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n
 
 
