@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -243,3 +244,16 @@ def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[st
         axis.yaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_locator(NullLocator())
     axis.grid(alpha=0.25)
+
+
+def draw_points(
+    draw: Any,
+    points: Float[np.ndarray, "n 2"],
+    numbers: Int[np.ndarray, " n"],
+    radius: float = 1.5,
+) -> None:
+    """Draw a dot at each (x, y), with a dark rim so that it is visible on any background."""
+    for (x, y), number in zip(points.tolist(), numbers.tolist(), strict=True):
+        for reach, ink in ((radius + 1, (0, 0, 0)), (radius, PALETTE[number % len(PALETTE)])):
+            ends = (round(x - reach), round(y - reach), round(x + reach), round(y + reach))
+            draw.rectangle(ends, fill=ink)

@@ -319,7 +319,7 @@ def _annotated(still: np.ndarray, step: Step, t: int, crop: tuple[slice, slice])
     image, draw = drawing.canvas_of(still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1))
     corner = np.array([crop[1].start, crop[0].start], float)
     places = zoom * (step.centres[0, t] - corner)
-    drawing.draw_points(draw, places, step.target[0, t], 0.5 * zoom)
+    plotting.draw_points(draw, places, step.target[0, t], 0.5 * zoom)
     return np.asarray(image)
 
 

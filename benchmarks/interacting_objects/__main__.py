@@ -23,7 +23,7 @@ from benchmarks.harness import Count, command
 from benchmarks.interacting_objects import scenes as made
 from benchmarks.interacting_objects.partitions import adaptive_partitions as adaptive
 from benchmarks.interacting_objects.scenes import BOX, NUM_FRAMES, SCENES, SHARPNESS, Scene
-from mpfjax.metrics.tracking_quality import recovery_rate, track_state
+from benchmarks.tracking_quality import recovery_rate, track_state
 
 REPULSION = 2 * SHARPNESS  # so that sharing a place never pays; none from a box's side on
 RUNS_AT_ONCE = 20

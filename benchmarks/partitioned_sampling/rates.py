@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.harness import Z_95, wilson
-from mpfjax.metrics.tracking_quality import (
+from benchmarks.tracking_quality import (
     precision,
     recall,
     recovery_rate,

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.figures import draw_contact_sheet, region
+from benchmarks.figures import draw_contact_sheet, draw_points, region
 from benchmarks.harness import write_figure
 from benchmarks.visual_tracking.source import Source
-from mpfjax.vision.boxes.following import Snapshot, annotate
+from mpfjax.vision.boxes.following import Snapshot
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
 
@@ -18,6 +18,7 @@ NAMES = {
     "gm_mpf": "Gaussian mixture particle filter",
 }
 KEY_FRAMES = 4
+WHOLE = (slice(None), slice(None))
 LEGEND = {"particles": 1, "mean box of a component": 2}  # and the numbers of their colours
 
 
@@ -26,7 +27,7 @@ def write_video(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) 
 
     def beside(still: np.ndarray, snapshots: Sequence[Snapshot]) -> np.ndarray:
         zoom = max(1, round(640 / still.shape[1]))
-        return np.concatenate([annotate(still, s, zoom) for s in snapshots], axis=1)
+        return np.concatenate([annotated(still, s, zoom) for s in snapshots], axis=1)
 
     shown = zip(source.read(), *tracked.values(), strict=False)
     frames.write_video(path, (beside(still, snapshots) for still, *snapshots in shown))
@@ -48,7 +49,7 @@ def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snap
     columns = [
         (
             NAMES[name],
-            [annotated(stills[t], snapshots[t], zoom, crop) for t in chosen],
+            [annotated(stills[t], snapshots[t], zoom, crop, [*LEGEND.values()]) for t in chosen],
         )
         for name, snapshots in tracked.items()
     ]
@@ -57,14 +58,28 @@ def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snap
 
 
 def annotated(
-    still: np.ndarray, snapshot: Snapshot, zoom: int, crop: tuple[slice, slice]
+    still: np.ndarray,
+    snapshot: Snapshot,
+    zoom: int,
+    crop: tuple[slice, slice] = WHOLE,
+    colours: Sequence[int] | None = None,
 ) -> np.ndarray:
-    """A crop with all particles in one colour, and all boxes in another."""
+    """A crop with the particles and the mean boxes of the first run.
+
+    Both have the colour of their component; with `colours` all particles have the first of these,
+    and all boxes the second.
+    """
     image, draw = drawing.canvas_of(still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1))
-    corner = np.array([crop[1].start, crop[0].start], float)
-    of_points, of_boxes = LEGEND.values()
-    points = zoom * (snapshot.points[0][snapshot.labels[0] >= 0] - corner)
-    drawing.draw_points(draw, points, np.full(len(points), of_points), 0.5 * zoom)
-    for box in box_files.top_left(snapshot.means[0][snapshot.active[0]]):
-        drawing.draw_box(draw, zoom * (box - [*corner, 0, 0]), of_boxes)
+    corner = np.array([crop[1].start or 0, crop[0].start or 0], float)
+    filled, alive = snapshot.labels[0] >= 0, np.flatnonzero(snapshot.active[0])
+    of_points, of_boxes = snapshot.labels[0][filled], alive
+    if colours is not None:
+        of_points, of_boxes = (
+            np.full(len(each), colour)
+            for each, colour in zip((of_points, of_boxes), colours, strict=True)
+        )
+    points = zoom * (snapshot.points[0][filled] - corner)
+    draw_points(draw, points, of_points, 0.5 * zoom)
+    for box, colour in zip(box_files.top_left(snapshot.means[0][alive]), of_boxes, strict=True):
+        drawing.draw_box(draw, zoom * (box - [*corner, 0, 0]), int(colour))
     return np.asarray(image)

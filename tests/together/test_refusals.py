@@ -31,7 +31,6 @@ from mpfjax import (
     tuning,
     vision,
 )
-from mpfjax.metrics.tracking_quality import tracking_quality
 from mpfjax.moves.initial import SelectInitial
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.exclusion import Exclusion
@@ -168,7 +167,6 @@ WITH_BOXES = {
     **alike(SETS, metrics.ospa, metrics.gospa),
     metrics.crps: {"values": np.ones(5), "weights": np.ones(5), "observations": np.ones(())},
     metrics.log_score: {"model": MODEL, "mixture": MIXTURE, "observation": 1.0},
-    tracking_quality: {"estimates": np.ones((2, 3, 1, 4)), "truth": np.ones((3, 1, 4))},
     metrics.multi_object_scores: {"tracks": ROWS, "truth": ROWS},
 }  # fmt: skip
 # What an argument is called further down.
@@ -411,7 +409,6 @@ REFUSED = (
     ("weights: shape", lambda: metrics.crps(np.ones((2, 3)), np.ones((2, 4)), TWO)),
     (r"observations: shape \(3,\) is not \(2\)",
      lambda: metrics.crps(np.ones((2, 3)), np.ones((2, 3)), THREE)),
-    ("truth: shape", lambda: tracking_quality(np.ones((2, 3, 1, 4)), np.ones((2, 1, 4)))),
     ("tracks: id 1 has more than one box in frame 1",
      lambda: metrics.multi_object_scores(ROWS[[0, 1, 0]], ROWS)),
     # frames, boxes and detections

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from mpfjax.vision.boxes.following import Snapshot, annotate, follow, track_rows
+from mpfjax.vision.boxes.following import Snapshot, follow, track_rows
 from mpfjax.vision.boxes.recipes import PRESETS
 from tests.marking import weekly
 
@@ -34,25 +34,6 @@ def test_a_track_is_a_life_of_a_component():
 def test_or_a_hypothesis_about_one_of_the_given_boxes():
     rows = track_rows(snapshots(), by_reference=True)
     assert rows[:, :2].tolist() == [[1, 1], [1, 2], [2, 1], [3, 1], [3, 1], [3, 2]]
-
-
-def drawn_on_dark():
-    """A dark frame, and a snapshot of one box and one particle near its lower right corner."""
-    snapshot = Snapshot(
-        means=np.array([[[80.0, 50, 20, 12]]]),
-        active=np.ones((1, 1), bool),
-        points=np.array([[[80.0, 50.0]]]),
-        labels=np.zeros((1, 1), int),
-    )
-    return np.full((60, 100, 3), 30, np.uint8), snapshot
-
-
-def test_a_crop_counts_as_slices_do():
-    """What is drawn is where it is in the whole frame, enlarged and from both ends."""
-    frame, snapshot = drawn_on_dark()
-    part = annotate(frame, snapshot, 2, (slice(-30, 1000), slice(-40, -5)))
-    np.testing.assert_array_equal(part, annotate(frame, snapshot, 2)[60:120, 120:190])
-    assert (part != 30).any()
 
 
 @pytest.mark.exactness

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import Count, CountOrZero, checked, to_rows
+from mpfjax.checks import CountOrZero, checked, to_rows
 from mpfjax.filter import Filter, with_densities
 from mpfjax.models.observations import one_observation
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
@@ -18,7 +18,6 @@ from mpfjax.operations.random import split_once
 from mpfjax.vision.boxes.hypotheses import LearnedColourModel, best_components, component_references
 from mpfjax.vision.boxes.recipes import objects_filters
 from mpfjax.vision.files import boxes as box_files
-from mpfjax.vision.files import drawing
 from mpfjax.vision.files.frames import of_one_kind
 from mpfjax.vision.tracking.state import Tracks
 
@@ -113,31 +112,6 @@ def track_rows(
             rows.append([frame, alive[m], *box_files.top_left(mean[None])[0]])
     # Rounded as in the file, so that scores from the file are the same.
     return np.round(np.array(rows, float).reshape(-1, 6), 3)
-
-
-@checked
-def annotate(
-    frame: UInt8[np.ndarray, "h w 3"],
-    snapshot: Snapshot,
-    zoom: Count = 1,
-    crop: tuple[slice, slice] = (slice(None), slice(None)),
-) -> UInt8[np.ndarray, "zh zw 3"]:
-    """A frame, cropped and enlarged, with the particles and mean boxes of the first run.
-
-    Both are drawn in the colour of their component. `crop` is a slice of rows and one of columns;
-    negative numbers count from the end. `zoom` is the side in pixels to which each pixel is
-    enlarged. Raises `ValueError` for a zoom that is not a whole number from 1 on.
-    """
-    image, draw = drawing.canvas_of(frame[crop].repeat(zoom, axis=0).repeat(zoom, axis=1))
-    top, left = (part.indices(n)[0] for part, n in zip(crop, frame.shape[:2], strict=True))
-    corner = np.array([left, top], float)
-    for m in np.flatnonzero(snapshot.active[0]):
-        box = box_files.top_left(snapshot.means[0][m][None])[0] - [*corner, 0, 0]
-        drawing.draw_box(draw, zoom * box, int(m))
-    filled = snapshot.labels[0] >= 0
-    points = zoom * (snapshot.points[0][filled] - corner)
-    drawing.draw_points(draw, points, snapshot.labels[0][filled], 0.5 * zoom)
-    return np.asarray(image)
 
 
 @checked

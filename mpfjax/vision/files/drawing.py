@@ -1,4 +1,4 @@
-"""Drawing on RGB frames by Pillow: boxes with their numbers, and points.
+"""Drawing on RGB frames by Pillow: boxes with their numbers.
 
 Coordinates are in pixels; the centre of the first pixel is at (0.5, 0.5). What is drawn covers
 whole pixels, which is a hundred times quicker than smooth edges on a large frame.
@@ -7,7 +7,7 @@ whole pixels, which is a hundred times quicker than smooth edges on a large fram
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 # Okabe and Ito's palette, in the order of use; people with colour blindness can tell it apart. In
 # place of black, which numbers on a dark plate cannot have, there is a light green.
@@ -30,19 +30,6 @@ def draw_box(draw: Any, box: Float[np.ndarray, "4"], number: int, thickness: int
     x, y, w, h = box.tolist()
     corners = (round(x), round(y), round(x + w), round(y + h))
     draw.rectangle(corners, outline=PALETTE[number % len(PALETTE)], width=thickness)
-
-
-def draw_points(
-    draw: Any,
-    points: Float[np.ndarray, "n 2"],
-    numbers: Int[np.ndarray, " n"],
-    radius: float = 1.5,
-) -> None:
-    """Draw a dot at each (x, y), with a dark rim so that it is visible on any background."""
-    for (x, y), number in zip(points.tolist(), numbers.tolist(), strict=True):
-        for reach, ink in ((radius + 1, (0, 0, 0)), (radius, PALETTE[number % len(PALETTE)])):
-            ends = (round(x - reach), round(y - reach), round(x + reach), round(y + reach))
-            draw.rectangle(ends, fill=ink)
 
 
 def with_tracks(

@@ -1,33 +1,14 @@
-"""Track state, precision, recall, success and recovery rates of boxes, over many runs.
+"""Track state, precision, recall, success and recovery rates of boxes, shared by commands.
 
 The measures of Smith and Gatica-Perez (2004), section 3.1, for one box of each object in each
 frame, E the estimated box and G the true one. Boxes are (x, y, w, h) with (x, y) the top-left
 corner, in pixels. All functions work under jit and vmap.
 """
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.checks import Count, checked, real_array
-
-
-class TrackingQuality(NamedTuple):
-    """The result of `tracking_quality`, each of shape (objects,), rates and shares in [0, 1].
-
-    - `success_rate`: the share of runs in which the object is tracked in every frame.
-    - `recovery_rate`: the share of runs in which it is tracked throughout, or again at the end.
-    - `precision`, `recall`: means over all frames of all runs in which it is tracked, zero where
-      there is none.
-    - `tracked`: the share of frames in which it is tracked.
-    """
-
-    success_rate: Float[Array, " objects"]
-    recovery_rate: Float[Array, " objects"]
-    precision: Float[Array, " objects"]
-    recall: Float[Array, " objects"]
-    tracked: Float[Array, " objects"]
+from mpfjax.checks import Count, checked
 
 
 def intersection_area(
@@ -90,38 +71,6 @@ def recovery_rate(
     to_come = jnp.cumsum(present[::-1].astype(jnp.int32), axis=0)[::-1]
     fine = track_states | ~(present & (to_come <= num_last))[None]
     return jnp.mean(jnp.all(fine, axis=1).astype(jnp.result_type(float)), axis=0)
-
-
-def tracking_quality(
-    estimates: Float[Array, "runs t objects 4"],
-    truth: Float[Array, "t objects 4"],
-    *,
-    num_last: Count = 1,
-) -> TrackingQuality:
-    """All measures of section 3.1 for each object, over runs.
-
-    A frame in which an object's true box holds a NaN has no such object and does not count for
-    it. `num_last` is that of `recovery_rate`. Raises `ValueError` for no runs or no frames, for
-    boxes of other shapes, and as `recovery_rate` does.
-    """
-    estimates = real_array("runs t objects 4", "estimates", estimates)
-    truth = real_array(" ".join(map(str, estimates.shape[1:])), "truth", truth)
-    present = jnp.all(jnp.isfinite(truth), axis=-1)
-    states = track_state(estimates, truth[None])
-    tracked = states.astype(estimates.dtype)
-    count = jnp.sum(tracked, axis=(0, 1))
-
-    def over_tracked(values: Float[Array, "runs t objects"]) -> Float[Array, " objects"]:
-        return jnp.sum(values * tracked, axis=(0, 1)) / jnp.maximum(count, 1.0)
-
-    frames = estimates.shape[0] * jnp.sum(present.astype(estimates.dtype), axis=0)
-    return TrackingQuality(
-        success_rate=success_rate(states, present),
-        recovery_rate=recovery_rate(states, present, num_last=num_last),
-        precision=over_tracked(precision(estimates, truth[None])),
-        recall=over_tracked(recall(estimates, truth[None])),
-        tracked=count / jnp.maximum(frames, 1.0),
-    )
 
 
 def _share(area: Float[Array, "*batch"], boxes: Float[Array, "*#batch 4"]) -> Float[Array, "..."]:

@@ -1,17 +1,15 @@
 """The measures of section 3.1, on boxes and runs small enough to count by hand."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.metrics.tracking_quality import (
+from benchmarks.tracking_quality import (
     precision,
     recall,
     recovery_rate,
     success_rate,
     track_state,
-    tracking_quality,
 )
 
 G = jnp.array([10.0, 20.0, 40.0, 20.0])
@@ -57,24 +55,3 @@ def test_rates_by_hand():
     both = jnp.stack([STATES, ~STATES], axis=2)
     np.testing.assert_array_equal(success_rate(both), [0.25, 0.0])
     np.testing.assert_array_equal(recovery_rate(both), [0.75, 0.25])
-
-
-@pytest.mark.exactness
-def test_all_measures_of_two_objects():
-    """Object 0 is tracked in half, one run only; object 1 is not there in the second frame."""
-    truth = jnp.broadcast_to(G, (2, 2, 4)).at[1, 1].set(jnp.nan)
-    away = box(500, 500, 40, 20)
-    quarter = box(30, 30, 40, 20)
-    estimates = jnp.stack(
-        [jnp.stack([jnp.stack([G, G]), jnp.stack([quarter, away])]),
-         jnp.stack([jnp.stack([G, away]), jnp.stack([away, away])])]
-    )  # fmt: skip
-    for quality in (
-        tracking_quality(estimates, truth),
-        jax.jit(tracking_quality)(estimates, truth),
-    ):
-        np.testing.assert_allclose(quality.success_rate, [0.5, 0.5])
-        np.testing.assert_allclose(quality.recovery_rate, [0.5, 0.5])
-        np.testing.assert_allclose(quality.precision, [2.25 / 3, 1.0], rtol=1e-6)
-        np.testing.assert_allclose(quality.recall, [2.25 / 3, 1.0], rtol=1e-6)
-        np.testing.assert_allclose(quality.tracked, [0.75, 0.5])
