@@ -1,4 +1,4 @@
-"""What `track` makes of far origins, of masked arrays, and of gaps between detections."""
+"""What `track` makes of far origins, and of gaps between detections."""
 
 import numpy as np
 import pytest
@@ -96,48 +96,3 @@ def test_the_origin_moves_the_bounds_of_the_frame_too():
     tracks = list(track(None, iter(found), TRACKER, frame_size=(side, side)))
     assert living(tracks[6]) == [1]
     assert living(tracks[-1]) == []
-
-
-# --- masked arrays -------------------------------------------------------------------------
-
-
-def masked(rows, which, columns):
-    mask = np.zeros(rows.shape, bool)
-    mask[np.ix_(which, columns)] = True
-    return np.ma.array(rows, mask=mask)
-
-
-def same(some, others):
-    for a, b in zip(some, others, strict=True):
-        for name in ("identities", "shown", "boxes"):
-            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-
-
-def spoilt(rows):
-    """Two rows more in every frame, far off, and which they are."""
-    bad = np.concatenate([placed(rows[rows[:, 2] < 5], 50.0 + n, 70) for n in range(2)])
-    rows = np.concatenate([bad, rows])
-    order = np.argsort(rows[:, 0], kind="stable")
-    return rows[order], np.flatnonzero(order < len(bad))
-
-
-@pytest.mark.parametrize("columns", [range(7), range(2, 6), [3]])
-def test_masked_rows_are_no_detections(columns):
-    rows, bad = spoilt(crowd(8))
-    expected = list(track(None, crowd(8), TRACKER))
-    same(list(track(None, masked(rows, bad, columns), TRACKER)), expected)
-
-
-def test_masked_boxes_of_a_frame_are_no_detections_and_rows_are_those_given():
-    rows = crowd(8)
-    found = []
-    for boxes, scores in by_frame(rows):
-        more = np.concatenate([boxes[:1] + 50, boxes])
-        found.append((masked(more, [0], range(4)), np.concatenate([[0.5], scores])))
-    tracks = list(track(None, iter(found), TRACKER))
-    expected = list(track(None, rows, TRACKER))
-    same(tracks, expected)
-    for a, b in zip(tracks, expected, strict=True):
-        np.testing.assert_array_equal(
-            a.detections, np.where(b.detections < 0, -1, b.detections + 1)
-        )

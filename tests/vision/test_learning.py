@@ -142,7 +142,7 @@ def test_the_mean_product_of_innovations_is_the_cameras_variance(sigma, num_obje
     small = np.full_like(places, 0.02)
     predicted = Gaussian(places, 0 * places, small, small, small)
     cost = np.where(np.eye(num_objects, dtype=bool), -1.0, 1.0)
-    camera, gone, kept = CameraState.initial(), np.zeros((1, 2)), []
+    camera, gone, kept = CameraState(), np.zeros((1, 2)), []
     for _ in range(600):
         gaps = rng.normal(0, sigma, 2) + rng.normal(0, 0.1, (num_objects, 2))
         seen = places + np.pad(gaps, [(0, 0), (0, 2)])
@@ -231,7 +231,7 @@ def test_equal_scores_are_all_strong(score):
 
 def test_predictions_are_shown_for_as_long_as_they_were_right():
     """At 25 frames a second: a tenth of one before anything is known."""
-    spans, coasting, ten = Spans.at(25.0), Coasting.initial(), np.full(3, 10.0)
+    spans, coasting, ten = Spans.at(25.0), Coasting(), np.full(3, 10.0)
     assert coasting.longest(spans) == 2
     all_three, none = np.ones(3, bool), np.zeros(3, bool)
     right = wrong = coasting
@@ -250,7 +250,7 @@ def test_who_never_leaves_a_neighbour_before_it_ends_is_a_double():
     together, seen = np.array([[1.0, 0.4], [0.4, 1.0]]), np.ones(2, bool)
 
     def many(overlaps_before_the_end, ends):
-        duplicates, lives_on = Duplicates.initial(), np.zeros(0, bool)
+        duplicates, lives_on = Duplicates(), np.zeros(0, bool)
         for name in range(2, 14):
             names = np.array([1, name])
             duplicates = duplicates.after(names, lives_on, seen, together)

@@ -9,9 +9,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import CountOrZero, checked, is_series, saying, shown, warn
+from mpfjax.checks import CountOrZero, checked, is_series, saying, shown, to_rows, warn
 from mpfjax.vision.files.boxes import read_detections
-from mpfjax.vision.tracking.detections import Detections, to_masked_rows
+from mpfjax.vision.tracking.detections import Detections
 
 _NAMES = {4: "frame,id,x,y,w,h,score", 2: "frame,id,x,y,score"}
 # A tracker that is made for rows of detections has room for at most so many objects.
@@ -42,16 +42,15 @@ class Rows:
         if rows.ndim != 2 or not (rows.size == 0 or self._score <= rows.shape[1] <= most):
             raise ValueError(f"detections: shape {rows.shape} is not of {_NAMES[coordinates]}")
         rows = rows if rows.size else np.zeros((0, self._score + 1))
-        rows = to_masked_rows(rows.shape[1], "detections", rows)
+        rows = to_rows(rows.shape[1], "detections", rows)
         bad = ~np.isfinite(rows[:, 0]) | (rows[:, 0] % 1 != 0) | (rows[:, 0] < 1)
-        for number in np.flatnonzero(bad.filled(False))[:1]:
-            row = shown(rows.data[number])
+        for number in np.flatnonzero(bad)[:1]:
+            row = shown(rows[number])
             raise ValueError(f"detections: row {number}, {row}, is of no frame; they count from 1")
         # Which row each is, in the order of the frames.
-        places = np.flatnonzero(~np.ma.getmaskarray(rows)[:, 0])
-        self.places = places[np.argsort(rows.data[places, 0], kind="stable")]
+        self.places = np.argsort(rows[:, 0], kind="stable")
         self._rows = rows[self.places]
-        self.frames = self._rows.data[:, 0].astype(int)
+        self.frames = self._rows[:, 0].astype(int)
         self.is_limited = last is not None
         self.last = int(self.frames.max(initial=0)) if last is None else last
 

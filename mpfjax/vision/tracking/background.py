@@ -1,17 +1,22 @@
 """Moving objects found by background subtraction, so that a tracker needs no drawn box."""
 
 from collections import deque
-from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from mpfjax.checks import Count, InnerShare, NotNegative, Positive, checked
+from mpfjax.checks import Count, Positive, checked
 from mpfjax.vision.files.frames import check_frame
 from mpfjax.vision.tracking.optical_flow import opencv, reduced
 
 # What OpenCV's mask holds where a pixel is foreground; a shadow has another value.
 _FOREGROUND = 255
+# The share of a pixel's history that is background, and the darkest shadow beside it.
+_BACKGROUND_SHARE, _SHADOW_BRIGHTNESS = 0.6, 0.6
+# The height of gaps that are closed, as a share of the median height of the blobs so far.
+_LARGEST_GAP = 0.1
+# A frame with more is reduced before detection, by a whole number along both sides.
+_MOST_PIXELS = 640 * 480
 # How many blobs the median shape is taken over, and the fewest that it is taken over.
 _REMEMBERED, _ENOUGH = 500, 20
 # A part that is cut from a blob has at least this share of an object's usual width.
@@ -33,24 +38,11 @@ class BackgroundSubtraction:
     are single objects. Two objects one behind the other remain one blob, and an object that stands
     still long enough becomes background.
 
-    - `history`: frames over which the background is forgotten.
+    - `history`: frames over which the background is forgotten. An object that stands still becomes
+      background after about half as many, or earlier in a young video; ghosts, left where an object
+      stood from the first frame on, vanish by the same rule.
     - `threshold`: how many standard deviations from a Gaussian a pixel still belongs to it.
-    - `background_share`: share of a pixel's history, in (0, 1), that is background. An object that
-      stands still becomes background after about log(1 / share) · history frames, or earlier in a
-      young video, after (1 / share² - 1) times the number of frames before it stopped. A larger
-      share makes it earlier. Ghosts, left where an object stood from the first frame on, vanish by
-      the same rule.
-    - `shadow_brightness`: darkest shadow, as a share of the background's brightness, in (0, 1);
-      None where shadows count as foreground.
-    - `warm_up`: the number of first frames that only teach the background, at least 1.
     - `area`: least and largest area of a box, as shares of the frame's.
-    - `aspect`: least and largest height of a box, in widths; None accepts any shape.
-    - `largest_gap`: height of the gaps that are closed, as a share of the median height of the
-      blobs so far; of an eighth of the frame's height until there are a few.
-    - `cut_aspect`: a blob lower than this many widths may be cut; None takes the median of the
-      blobs so far, once there are a few, and 0 cuts none.
-    - `most_pixels`: a frame with more pixels is reduced before detection, by a whole number along
-      both sides; boxes are in pixels of the original frame.
 
     Defaults are tuned on people before a street camera. An instance serves one video, since it
     keeps that video's background. Colour channels may come in any fixed order. Use it to start
@@ -65,78 +57,40 @@ class BackgroundSubtraction:
         *,
         history: Count = 500,
         threshold: Positive = 8.0,
-        background_share: InnerShare = 0.6,
-        shadow_brightness: InnerShare | None = 0.6,
-        warm_up: Count = 1,
         area: tuple[float, float] = (0.0015, 0.3),
-        aspect: tuple[float, float] | None = None,
-        largest_gap: NotNegative = 0.1,
-        cut_aspect: NotNegative | None = None,
-        most_pixels: Count = 640 * 480,
     ) -> None:
-        aspect = (0.0, np.inf) if aspect is None else aspect
-        for name, (least, most), limit in (("area", area, 1), ("aspect", aspect, np.inf)):
-            if not 0 <= least < most <= limit:
-                raise ValueError(f"{name}: {(least, most)} is not a range within [0, {limit}]")
+        if not 0 <= area[0] < area[1] <= 1:
+            raise ValueError(f"area: {area} is not a range within [0, 1]")
         self._cv2 = opencv()
-        self.history, self.threshold = history, threshold
-        self.background_share, self.shadow_brightness = background_share, shadow_brightness
-        self.warm_up, self.most_pixels = warm_up, most_pixels
-        self.area, self.aspect = area, aspect
-        self.largest_gap, self.cut_aspect = largest_gap, cut_aspect
-        self._forget()
-
-    def learn(self, frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
-        """Learn the background afresh from frames of the video, all with the same weight.
-
-        A hundred frames, spread evenly over a long video, are enough. `detect` then finds objects
-        from its first frame on. A pixel that an object covers in a share 1 - `background_share` of
-        these frames counts as background. Use it where the whole video is at hand. Raises
-        `ValueError` where there are no frames, and for frames as `detect` does.
-        """
-        self._forget()
-        for number, frame in enumerate(frames, 1):
-            self._subtract(frame, rate=1 / number)
-        if self._shape is None:
-            raise ValueError("frames: there are none to learn the background from")
-        self._frames_seen = max(self.history, self.warm_up)
+        self.history, self.area = history, area
+        self._background = self._cv2.createBackgroundSubtractorMOG2(history, threshold**2, True)
+        self._background.setBackgroundRatio(_BACKGROUND_SHARE)
+        self._background.setShadowThreshold(_SHADOW_BRIGHTNESS)
+        self._frames_seen, self._shape = 0, None
+        self._aspects: deque[float] = deque(maxlen=_REMEMBERED)
+        self._heights: deque[int] = deque(maxlen=_REMEMBERED)
 
     def detect(self, frame: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "k 4"]:
         """The boxes (x, y, w, h) in pixels of moving objects, with (x, y) the top-left corner.
 
-        Boxes lie inside the frame, ordered from left to right. The first `warm_up` frames have
-        none. The frame joins the background; the fewer frames came before, the larger is its
-        weight. Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, or whose size
-        differs from that of the frames before it.
+        Boxes lie inside the frame, ordered from left to right. The first frame has none. A frame
+        joins the background; the fewer came before, the larger is its weight. Raises `ValueError`
+        for a frame that is not (h, w, 3) of type uint8, or whose size differs from that of the
+        frames before it.
         """
         # OpenCV's own schedule: a young background learns fast, so that an object that was
         # there in the first frame leaves no ghost.
         rate = 1 / min(2 * (self._frames_seen + 1), self.history)
         foreground = self._subtract(frame, rate)
         self._frames_seen += 1
-        if self._frames_seen <= self.warm_up:
+        if self._frames_seen == 1:
             return np.zeros((0, 4))
         boxes = np.array(self._blobs(foreground), float).reshape(-1, 4)
-        width, height = boxes[:, 2], boxes[:, 3]
-        shares = width * height / foreground.size
-        fits = (shares >= self.area[0]) & (shares <= self.area[1])
-        fits &= (height >= self.aspect[0] * width) & (height <= self.aspect[1] * width)
-        boxes = boxes[fits]
+        shares = boxes[:, 2] * boxes[:, 3] / foreground.size
+        boxes = boxes[(shares >= self.area[0]) & (shares <= self.area[1])]
         boxes = boxes[np.lexsort((boxes[:, 1], boxes[:, 0]))]
         scale = np.divide(np.shape(frame)[1::-1], foreground.shape[::-1])
         return boxes * np.tile(scale, 2)
-
-    def _forget(self) -> None:
-        shadows = self.shadow_brightness is not None
-        self._background = self._cv2.createBackgroundSubtractorMOG2(
-            self.history, self.threshold**2, shadows
-        )
-        self._background.setBackgroundRatio(self.background_share)
-        if self.shadow_brightness is not None:
-            self._background.setShadowThreshold(self.shadow_brightness)
-        self._frames_seen, self._shape = 0, None
-        self._aspects: deque[float] = deque(maxlen=_REMEMBERED)
-        self._heights: deque[int] = deque(maxlen=_REMEMBERED)
 
     def _subtract(self, frame: np.ndarray, rate: float) -> np.ndarray:
         """1 where a pixel is foreground; the frame joins the background with weight `rate`."""
@@ -146,7 +100,7 @@ class BackgroundSubtraction:
         if self._shape is not None and frame.shape != self._shape:
             raise ValueError(f"frame: {frame.shape} is not the shape before it, {self._shape}")
         self._shape = frame.shape
-        factor = int(np.ceil(np.sqrt(frame[..., 0].size / self.most_pixels)))
+        factor = int(np.ceil(np.sqrt(frame[..., 0].size / _MOST_PIXELS)))
         small = reduced(np.ascontiguousarray(frame), factor)
         mask = self._background.apply(small, learningRate=rate)
         return (mask == _FOREGROUND).astype(np.uint8)
@@ -154,7 +108,7 @@ class BackgroundSubtraction:
     def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
         known = len(self._heights) >= _ENOUGH
         usual = np.median(self._heights) if known else _UNKNOWN_HEIGHT * len(foreground)
-        gap = round(self.largest_gap * float(usual))
+        gap = round(_LARGEST_GAP * float(usual))
         if gap > 0:
             # Vertically only: people who walk side by side must not be joined.
             line = np.ones((gap + 1, 1), np.uint8)
@@ -173,8 +127,7 @@ class BackgroundSubtraction:
                 self._heights.append(h)
         # A blob lower than this many widths may be several objects; 0 where this is unknown.
         known = len(self._aspects) >= _ENOUGH
-        usual = float(np.median(self._aspects)) if known else 0.0
-        widest = usual if self.cut_aspect is None else self.cut_aspect
+        widest = float(np.median(self._aspects)) if known else 0.0
         for label, x, y, w, h in large:
             blob = labels[y : y + h, x : x + w] == label
             boxes += self._cut(blob, x, y, widest)
@@ -190,7 +143,7 @@ class BackgroundSubtraction:
         x, y = x + int(columns[0]), y + int(rows[0])
         blob = blob[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         height, width = blob.shape
-        most = min(self.aspect[1], _NARROWEST * widest)
+        most = _NARROWEST * widest
         narrowest = max(int(np.ceil(height / most)), 1) if most > 0 else width
         if height >= widest * width or width <= 2 * narrowest:
             return [(x, y, width, height)]

@@ -24,14 +24,9 @@ class CameraState(NamedTuple):
     - `weight`: how many frames of many objects they are the means of.
     """
 
-    deviations: Float[np.ndarray, "2"]
-    left: Float[np.ndarray, "2"]
-    weight: float
-
-    @classmethod
-    def initial(cls) -> "CameraState":
-        """A camera that is nearly still."""
-        return cls(np.full(2, _STILL), np.full(2, _STILL), _PRIOR)
+    deviations: Float[np.ndarray, "2"] = np.full(2, _STILL)
+    left: Float[np.ndarray, "2"] = np.full(2, _STILL)
+    weight: float = _PRIOR
 
     def after(
         self,

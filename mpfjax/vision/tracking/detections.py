@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from mpfjax.checks import shown, to_rows, warn
+from mpfjax.checks import shown, to_numbers, to_rows, warn
 from mpfjax.vision.files.boxes import centred
 from mpfjax.vision.tracking.gaussian import places_of
 
@@ -23,8 +23,6 @@ class Detections(NamedTuple):
     - `classes`: (k,), whole numbers from 1 on, and 0 for none.
     - `vectors`: (k, e), of whatever tells objects apart, such as embeddings for re-identification,
       on any scale; zeros where there is none.
-
-    Boxes with a masked entry are no detections.
     """
 
     boxes: Float[np.ndarray, "k n"]
@@ -42,11 +40,11 @@ class Detections(NamedTuple):
         """
         several = isinstance(found, tuple) and len(found) in (2, 3)
         given: tuple[Any, ...] = found if several or isinstance(found, cls) else (found,)
-        rows = to_masked_rows(coordinates, named, given[0])
+        rows = to_rows(coordinates, named, given[0])
         rest: list[Any] = []
         for each, values in zip(cls._fields[1:3], given[1:], strict=False):
             if values is not None:
-                values = np.ma.filled(np.ma.asarray(values, float), np.nan).reshape(-1)
+                values = np.array(to_numbers(f"{named}: {each}")(values))
                 if len(values) != len(rows):
                     raise ValueError(f"{named}: {len(values)} {each} for {len(rows)} boxes")
             rest.append(values)
@@ -97,7 +95,7 @@ class Found(NamedTuple):
         rows, scores, classes, vectors = found
         boxes = np.asarray(rows, float)
         scores = np.ones(len(rows)) if scores is None else scores
-        keep = ~np.ma.getmaskarray(rows).any(axis=1)
+        keep = np.ones(len(rows), bool)
         extent = np.array(_UNBOUNDED)
         if frame_size is not None:
             extent = np.array([0, 0, frame_size[1], frame_size[0]], float)
@@ -138,14 +136,3 @@ class Found(NamedTuple):
     def places(self) -> Float[np.ndarray, "d k"]:
         """(x, y, log w, log h), or (x, y)."""
         return places_of(self.boxes)
-
-
-def to_masked_rows(width: int, name: str, value: Any) -> np.ma.MaskedArray:
-    """The argument as rows of `width` numbers, of which masked ones stay masked."""
-    if isinstance(value, list | tuple) and any(map(np.ma.is_masked, value)):
-        value = np.ma.array(value)
-    mask: Any = False
-    if isinstance(value, np.ma.MaskedArray):
-        value, mask = value.data, np.ma.getmaskarray(value)
-    rows = to_rows(width, name, value)
-    return np.ma.array(rows, mask=np.broadcast_to(mask, rows.shape))

@@ -130,13 +130,8 @@ class Lives(NamedTuple):
 class Coasting(NamedTuple):
     """Predictions in frames without a detection: (20,) that proved `right`, and `wrong`, by age."""
 
-    right: Float[np.ndarray, " bins"]
-    wrong: Float[np.ndarray, " bins"]
-
-    @classmethod
-    def initial(cls) -> "Coasting":
-        """Nobody has coasted yet."""
-        return cls(np.zeros(_BINS), np.zeros(_BINS))
+    right: Float[np.ndarray, " bins"] = np.zeros(_BINS)
+    wrong: Float[np.ndarray, " bins"] = np.zeros(_BINS)
 
     def after(
         self,
@@ -182,14 +177,9 @@ class Duplicates(NamedTuple):
     - `objects`, `duplicates`: how many proved to be objects, and how many to be duplicates.
     """
 
-    elders: Int[np.ndarray, " m"]
-    objects: float
-    duplicates: float
-
-    @classmethod
-    def initial(cls) -> "Duplicates":
-        """Nobody began beside another one."""
-        return cls(np.zeros(0, int), 0.0, 0.0)
+    elders: Int[np.ndarray, " m"] = np.zeros(0, int)
+    objects: float = 0.0
+    duplicates: float = 0.0
 
     @property
     def doubtful(self) -> Bool[np.ndarray, " m"]:

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.tracking.camera import CameraState
 from mpfjax.vision.tracking.clutter import Clutter
+from mpfjax.vision.tracking.detections import FAULTS
 from mpfjax.vision.tracking.gaussian import Gaussian
 from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives
 from mpfjax.vision.tracking.noise import NoiseState
@@ -19,10 +20,11 @@ class TrackerState(NamedTuple):
     """All that an `ObjectTracker` remembers, with a row for each object.
 
     - `objects`: the moments of place and velocity, (m, 4) each, or (m, 2) of points.
-    - `lives`, `coasting`, `duplicates`: identities and counts; how long predictions are right;
-      which are a second box of another one.
-    - `scores`, `camera`, `noise`: what has been learned of the detector, the camera and the motion.
+    - `lives`: identities and counts.
+    - `scores`, `noise`, `camera`: what has been learned of the detector, the motion and the camera.
     - `colours`: (m, bins), the histograms of each object, all zero where it has none.
+    - `coasting`, `duplicates`: how long predictions are right; which are a second box of another
+      one.
     - `vectors`: (m, e), as the detector's; `likeness`: what has been learned of these.
     - `clutter`: of points, how densely those of nobody lie.
     - `last_identity`: the highest ever given.
@@ -36,22 +38,22 @@ class TrackerState(NamedTuple):
 
     objects: Gaussian
     lives: Lives
-    coasting: Coasting
-    duplicates: Duplicates
     scores: ScoreState
-    camera: CameraState
     noise: NoiseState
     colours: Float[np.ndarray, "m bins"]
-    vectors: Float[np.ndarray, "m e"]
-    likeness: Likeness
-    clutter: Clutter
-    last_identity: int
-    full: bool
-    begun: bool
-    waited: float
-    time: float | None
-    number: int
-    left_out: Int[np.ndarray, "3"]
+    coasting: Coasting = Coasting()
+    duplicates: Duplicates = Duplicates()
+    camera: CameraState = CameraState()
+    vectors: Float[np.ndarray, "m e"] = np.zeros((0, 0))
+    likeness: Likeness = Likeness()
+    clutter: Clutter = Clutter()
+    last_identity: int = 0
+    full: bool = False
+    begun: bool = False
+    waited: float = 0.0
+    time: float | None = None
+    number: int = 0
+    left_out: Int[np.ndarray, "3"] = np.zeros(len(FAULTS), int)
 
 
 class Tracks(NamedTuple):

@@ -18,9 +18,8 @@ from mpfjax.vision.tracking.associate import (
     probabilities,
     unlikeness,
 )
-from mpfjax.vision.tracking.camera import CameraState, jolted
-from mpfjax.vision.tracking.clutter import Clutter
-from mpfjax.vision.tracking.detections import FAULTS, Detections, Found
+from mpfjax.vision.tracking.camera import jolted
+from mpfjax.vision.tracking.detections import Detections, Found
 from mpfjax.vision.tracking.gaussian import (
     CameraMotion,
     Gaussian,
@@ -31,11 +30,11 @@ from mpfjax.vision.tracking.gaussian import (
     units,
     within,
 )
-from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives, Spans
+from mpfjax.vision.tracking.lives import Lives, Spans
 from mpfjax.vision.tracking.noise import NoiseState
 from mpfjax.vision.tracking.scores import STRONG, WEAK, ScoreState
 from mpfjax.vision.tracking.state import TrackerState, Tracks
-from mpfjax.vision.tracking.vectors import Likeness, cosine_distances
+from mpfjax.vision.tracking.vectors import cosine_distances
 
 _COLOURS, _BANDS = HSVColours(num_hues=8, num_saturations=4, num_values=6), 3
 # Of a weak detection, of an object that is not confirmed, and of one of another class.
@@ -116,22 +115,9 @@ class ObjectTracker(Checked):
         return TrackerState(
             objects=Gaussian.none(self.coordinates),
             lives=Lives.begun(none, none, at_once=False),
-            coasting=Coasting.initial(),
-            duplicates=Duplicates.initial(),
             scores=ScoreState.initial(self.coordinates),
-            camera=CameraState.initial(),
             noise=NoiseState.initial(self.rate, self.coordinates),
             colours=np.zeros((0, _BANDS * _COLOURS.num_bins)),
-            vectors=np.zeros((0, 0)),
-            likeness=Likeness(),
-            clutter=Clutter(),
-            last_identity=0,
-            full=False,
-            begun=False,
-            waited=0.0,
-            time=None,
-            number=0,
-            left_out=np.zeros(len(FAULTS), int),
         )
 
     @checked
@@ -314,8 +300,8 @@ def advanced(
     if not is_boxes:
         clutter = clutter.after(places, len(places) - len(rows) if state.begun else 0)
     state = TrackerState(
-        objects, lives, coasting, duplicates, scores, state.camera,
-        noise._replace(moments=moments), colours, vectors, likeness, clutter,
+        objects, lives, scores, noise._replace(moments=moments), colours, coasting, duplicates,
+        state.camera, vectors, likeness, clutter,
         last_identity=state.last_identity + len(born), full=bool(np.sum(wanted) > len(born)),
         begun=True, waited=0.0, time=time, number=state.number,
         left_out=state.left_out + found.left_out,
