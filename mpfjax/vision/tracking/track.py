@@ -85,7 +85,8 @@ def track(
     Coordinates may be large, as those of maps are. Boxes that are not finite, have no area or lie
     outside the frame are left out; the first of each kind is warned of, and `Tracks.left_out`
     counts them. There are warnings for detections in frames after the last, and for more detections
-    or objects than there is room for. Raises `ValueError` with the name of the argument for values that cannot be used, at the frame
+    or objects than there is room for.
+    Raises `ValueError` with the name of the argument for values that cannot be used, at the frame
     in which they come, for a row more than a minute after the one before it where there are no
     `frames`, and `ImportError` for "pixels" without OpenCV. An exception of the detector is passed
     on, with the number of the frame. Use it for recorded videos and for cameras.
