@@ -85,24 +85,6 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         box = self.dynamics_of(states).sample(key_noise, states.box, states.previous)
         return self.with_history(BoxState(box, reference, None, states.appearance), states)
 
-    @property
-    def noise_dimension(self) -> int:
-        """That of the dynamics, plus one for r where it may be drawn again."""
-        return self.dynamics.noise_dimension + (self.switch_probability > 0)
-
-    def transition_from_noise(self, noise: Float[Array, "n k"], states: BoxState) -> BoxState:
-        """The same, made of standard normal noise."""
-        reference = states.reference
-        if self.switch_probability > 0:
-            # A uniform number below the probability is uniform there, so that it also draws r.
-            shares = jax.scipy.special.ndtr(noise[:, -1]) / self.switch_probability
-            k = self.reference_boxes.shape[0]
-            drawn = jnp.clip(jnp.floor(k * shares), 0, k - 1).astype(reference.dtype)
-            reference = jnp.where(shares < 1, drawn, reference)
-        noise = noise[:, : self.dynamics.noise_dimension]
-        box = self.dynamics_of(states).from_noise(noise, states.box, states.previous)
-        return self.with_history(BoxState(box, reference, None, states.appearance), states)
-
     def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
         """log D(x_t | x_{t-1}) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
         dynamics = self.dynamics_of(previous_states)
