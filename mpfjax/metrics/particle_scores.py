@@ -27,9 +27,9 @@ def crps(
     the absolute error where all weight is in one draw. A weight of zero leaves a draw out, and
     weights need not sum to one. A NaN in a row makes its score NaN.
 
-    Use it to score the draws of `mpfjax.forecast(..., simulate_observation=...)`, with the weights
-    of the forecast's mixtures. Raises `ValueError` for anything but arrays of real numbers, for
-    shapes that do not fit, and for a weight below zero.
+    Use it to score the observations of `mpfjax.forecast`, with the weights of the forecast's
+    mixtures. Raises `ValueError` for anything but arrays of real numbers, for shapes that do not
+    fit, and for a weight below zero.
     """
     values = real_array("... n", "values", values)
     *batch, n = map(str, values.shape)

@@ -18,10 +18,6 @@ SEEN = jnp.array([[0.8], [0.1], [-0.4]])
 NUM_STEPS = 3
 
 
-def observe(key, states):
-    return states + np.sqrt(0.4) * jax.random.normal(key, states.shape)
-
-
 @pytest.mark.weekly
 def test_moments_are_the_kalman_filters_and_components_keep_their_masses():
     filter = mpfjax.mixture_particle_filter(LINEAR, 100, 3)
@@ -31,7 +27,7 @@ def test_moments_are_the_kalman_filters_and_components_keep_their_masses():
     def one(key):
         key_run, key = jax.random.split(key)
         run = mpfjax.run_filter(key_run, filter, SEEN, lambda mixture: None)
-        ahead = forecast(key, filter, run.final, NUM_STEPS, simulate_observation=observe)
+        ahead = forecast(key, filter, run.final, NUM_STEPS)
 
         def moments(mixture, observations):
             x, y = mixture.particles[:, 0], observations[:, 0]
@@ -56,12 +52,18 @@ def test_moments_are_the_kalman_filters_and_components_keep_their_masses():
     assert np.abs(z).max() < 4, z
 
 
+class ObservedDrift(DriftOfOne):
+    """With draws of its observations."""
+
+    def sample_observation(self, key, state):
+        return state[0] + jax.random.normal(key)
+
+
 def test_a_wrapped_models_observations_are_drawn_one_by_one():
-    """Of one particle, as all functions of such a model are, each with noise of its own."""
-    filter = mpfjax.particle_filter(mpfjax.per_particle(DriftOfOne()), 400)
+    """Of one particle, as all methods of such a model are, each with noise of its own."""
+    filter = mpfjax.particle_filter(mpfjax.per_particle(ObservedDrift()), 400)
     mixture = filter.init(jax.random.key(0))
-    simulate = lambda key, state: state[0] + jax.random.normal(key)  # noqa: E731
-    ahead = forecast(jax.random.key(1), filter, mixture, 2, simulate_observation=simulate)
+    ahead = forecast(jax.random.key(1), filter, mixture, 2)
     noise = ahead.observations - ahead.mixtures.particles[..., 0]
     assert noise.shape == (2, 400)
     np.testing.assert_allclose(noise.std(axis=1), 1.0, atol=4 / np.sqrt(2 * 400))
@@ -73,7 +75,7 @@ def test_intervals_are_the_kalman_filters():
     seen = SEEN.at[-1].set(1.5)
     filter = mpfjax.mixture_particle_filter(LINEAR, 20_000, 3)
     run = mpfjax.run_filter(jax.random.key(1), filter, seen, lambda mixture: None)
-    ahead = forecast(jax.random.key(2), filter, run.final, NUM_STEPS, simulate_observation=observe)
+    ahead = forecast(jax.random.key(2), filter, run.final, NUM_STEPS)
     interval = jax.vmap(lambda mixture, values: mixture.quantile(values, [0.05, 0.95]))
     states = ahead.mixtures.particles
     found = interval(ahead.mixtures, jnp.concatenate([states, ahead.observations], axis=2))
