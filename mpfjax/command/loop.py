@@ -5,7 +5,6 @@ import collections
 import contextlib
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -30,7 +29,7 @@ from mpfjax.vision.boxes.following import follow_boxes
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
 from mpfjax.vision.files.sequences import Truth
-from mpfjax.vision.files.threads import read_ahead, write_behind
+from mpfjax.vision.files.threads import read_ahead
 from mpfjax.vision.tracking.adapters import LEAST_ROOM, Rows
 from mpfjax.vision.tracking.background import BackgroundSubtraction
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv, opencv_on_one_thread
@@ -44,8 +43,9 @@ class Results:
 
     def __init__(self, options: argparse.Namespace, source: Source) -> None:
         self.options, self.source = options, source
-        # Seconds that the run waits, and those of the thread that is ahead of it.
-        self.clock, self.ahead = Clock("track", "write"), Clock("read", "detect")
+        # Of the threads that read and look at frames, that track, and that write.
+        self.ahead, self.clock = Clock("read", "detect"), Clock("track")
+        self.last = Clock("write", "wait")
         self.rows: list[np.ndarray] = []
         self.kept: list[Tracks] = []  # for --offline alone
         self.times: list[float] = []  # of the frames of a video
@@ -75,7 +75,7 @@ class Results:
     def summary(self) -> dict[str, Any]:
         """The content of summary.json."""
         rows, n = self.all_rows(), self.num_frames
-        seconds = self.ahead.seconds | self.clock.seconds
+        seconds = self.ahead.seconds | self.clock.seconds | {"write": self.last.seconds["write"]}
         summary = {
             "frames": n,
             "objects": len(np.unique(rows[:, 1])),
@@ -196,20 +196,35 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
 
 
 def _track(results: Results, start: Start) -> None:
-    """The loop over frames."""
-    options, source, clock = results.options, results.source, results.clock
+    """The loop over frames; where a video is drawn, the tracks are made ahead of it."""
+    options, source = results.options, results.source
     untracked: collections.deque[np.ndarray | None] = collections.deque()
+    has_video = source.has_pixels and not options.no_video
 
     def watched(stills: Iterator[Any]) -> Iterator[Any]:
         for still in results.ahead.over("read", stills):
             untracked.append(still)
             yield still
 
+    def with_rows(tracks: Iterator[Tracks]) -> Iterator[tuple[np.ndarray | None, np.ndarray]]:
+        for each in results.clock.over("track", tracks):
+            yield untracked.popleft() if source.has_pixels else None, results.add(each)
+
+    def written(tracked: Iterator[Any]) -> Iterator[np.ndarray | None]:
+        """The frames of the video, None where there is no picture; each leaves its lines first."""
+        for number, (still, rows) in enumerate(results.last.over("wait", tracked)):
+            if number == 0:
+                # Until there is something to write, an older run's files stay as they are.
+                (options.out / SUMMARY).unlink(missing_ok=True)
+            # At once, so that a run that is killed leaves them too.
+            with open(options.out / TRACKS, "a" if number else "w", encoding="utf-8") as file:
+                file.write(box_files.format_tracks(rows))
+            bar.update()
+            yield drawing.with_tracks(still, rows) if has_video and still is not None else None
+
     bar = tqdm(total=source.num_frames, desc="Tracking", unit="frame", disable=None)
     with contextlib.ExitStack() as opened, bar:
-        file = draw = stills = None
-        if source.has_pixels and not options.no_video:
-            draw = opened.enter_context(_video(options.out / VIDEO, source.frames_per_second))
+        stills = None
         if source.has_pixels:
             path, times = source.path, results.times
             read = frames.read_frames(path, source.first, source.last, times=times)
@@ -218,41 +233,15 @@ def _track(results: Results, start: Start) -> None:
             if not (options.detect or options.box or options.no_colour) and has_opencv():
                 opened.enter_context(opencv_on_one_thread())
         # Closed before the thread that reads ends: it may wait for a frame.
-        tracked = opened.enter_context(contextlib.closing(start(stills)))
-        for tracks in clock.over("track", tracked):
-            still = untracked.popleft() if source.has_pixels else None
-            rows = results.add(tracks)
-            with clock.of("write"):
-                if file is None:
-                    # Until there is something to write, an older run's files stay as they are.
-                    (options.out / SUMMARY).unlink(missing_ok=True)
-                    file = opened.enter_context(open(options.out / TRACKS, "w", encoding="utf-8"))
-                # A line at once, so that a run that is killed leaves them too.
-                file.write(box_files.format_tracks(rows))
-                file.flush()
-                if draw is not None:
-                    draw(still, rows)
-            bar.update()
-
-
-@contextlib.contextmanager
-def _video(path: Path, frames_per_second: float | None) -> Iterator[Callable[..., None]]:
-    """A function that draws rows on a frame of a new video, in a thread of its own."""
-    unwritten: collections.deque[np.ndarray] = collections.deque()
-    latest = None
-
-    with frames.open_video(path, frames_per_second or 10.0) as append:
-
-        def draw(still: np.ndarray | None, rows: np.ndarray) -> None:
-            nonlocal latest
-            latest = latest if still is None else still
-            unwritten.append(rows)
-            # In the place of a frame that cannot be decoded, the one before it, or after it.
-            while latest is not None and unwritten:
-                append(drawing.with_tracks(latest, unwritten.popleft()))
-
-        with write_behind(draw) as hand_over:
-            yield hand_over
+        tracked = with_rows(opened.enter_context(contextlib.closing(start(stills))))
+        if has_video:
+            tracked = opened.enter_context(read_ahead(tracked))
+        with results.last.of("write"):
+            if has_video:
+                rate = source.frames_per_second or 10.0
+                frames.write_video(options.out / VIDEO, written(tracked), rate)
+            else:
+                collections.deque(written(tracked), maxlen=0)
 
 
 def _table(summary: dict[str, Any]) -> str:

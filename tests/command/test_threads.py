@@ -1,4 +1,4 @@
-"""Reading ahead and writing behind: order, errors, bounds, and an end however the block is left."""
+"""Reading ahead: order, errors, bounds, and an end however the block is left."""
 
 # How a block ends is what is tried here:
 # ruff: noqa: PT012, PT031
@@ -9,7 +9,7 @@ import warnings
 import pytest
 
 from mpfjax.vision.files import threads
-from mpfjax.vision.files.threads import read_ahead, write_behind
+from mpfjax.vision.files.threads import read_ahead
 
 
 @pytest.fixture(autouse=True)
@@ -56,33 +56,3 @@ def test_no_more_is_made_than_there_is_room_for_and_leaving_closes_it():
     assert closed.is_set()
     # Those that wait, the one that was taken, and one in the thread's hands.
     assert len(made) <= threads._WAITING + 2
-
-
-def test_calls_are_made_in_order_and_all_of_them_also_when_interrupted():
-    written, go = [], threading.Event()
-
-    def write_slowly(*two):
-        assert go.wait(60)
-        written.append((threading.current_thread(), two))
-
-    with pytest.raises(KeyboardInterrupt), write_behind(write_slowly) as write:
-        for number in range(3):
-            write(number, -number)
-        go.set()
-        raise KeyboardInterrupt
-    assert [two for _, two in written] == [(0, 0), (1, -1), (2, -2)]
-    assert threading.current_thread() not in {thread for thread, _ in written}
-
-
-@pytest.mark.parametrize("calls", [1, 100], ids=["at the end", "by a later call"])
-def test_an_error_of_writing_is_raised_and_ends_it(calls):
-    tried = []
-
-    def fail(number):
-        tried.append(number)
-        raise OSError("no space left")
-
-    with pytest.raises(OSError, match="no space left"), write_behind(fail) as write:
-        for number in range(calls):
-            write(number)
-    assert tried == [0]

@@ -4,7 +4,7 @@ import contextlib
 import heapq
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -100,7 +100,8 @@ def write_video(
 ) -> None:
     """Write RGB frames to an MP4 or, by the ending of `path`, a GIF that loops.
 
-    None, a frame that could not be decoded, is written as the frame before it. Raises
+    None, a frame that could not be decoded, is written as the frame before it. The file is complete
+    also where the frames end by an exception, and there is none before the first frame. Raises
     `ValueError` for another ending, frames that are no images of one size and a rate that is not
     positive, `ImportError` where PyAV is missing for an MP4.
     """
@@ -112,40 +113,27 @@ def write_video(
         duration = 1000 / frames_per_second
         next(images).save(path, save_all=True, append_images=images, duration=duration, loop=0)
         return
-    with open_video(path, frames_per_second) as append:
-        for still in stills:
-            append(still)
-
-
-@contextlib.contextmanager
-def open_video(
-    path: str | Path, frames_per_second: float = 10.0
-) -> Iterator[Callable[[UInt8[np.ndarray, "h w 3"]], None]]:
-    """A context that appends RGB frames to a new MP4, complete however the block ends.
-
-    There is no file before the first frame. Use it where frames are made one at a time.
-    """
     if Path(path).suffix.lower() != ".mp4":
         raise ValueError(f"path: {path} ends in neither .mp4 nor .gif")
     library, rate = optional("av", "av"), Fraction(frames_per_second).limit_denominator(1001)
-    with contextlib.ExitStack() as opened:
-        file: Any = None
-        stream: Any = None
+    file: Any = None
+    stream: Any = None
 
-        def append(frame: np.ndarray) -> None:
-            nonlocal file, stream
+    def finish() -> None:
+        file.mux(stream.encode())
+
+    with contextlib.ExitStack() as opened:
+        for still in stills:
             # The pixel format of an MP4 needs an even height and width.
-            height, width, _ = frame.shape
-            frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+            height, width, _ = still.shape
+            still = np.pad(still, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             if stream is None:
                 file = opened.enter_context(library.open(_url(path), "w"))
                 stream = file.add_stream("libx264", rate=rate, options=_X264)
-                stream.height, stream.width, stream.pix_fmt = *frame.shape[:2], "yuv420p"
+                stream.height, stream.width, stream.pix_fmt = *still.shape[:2], "yuv420p"
                 stream.codec_context.thread_count = 0  # one for each processor
-                opened.callback(lambda: file.mux(stream.encode()))
-            file.mux(stream.encode(library.VideoFrame.from_ndarray(frame, format="rgb24")))
-
-        yield append
+                opened.callback(finish)
+            file.mux(stream.encode(library.VideoFrame.from_ndarray(still, format="rgb24")))
 
 
 def check_frame(frame: Any, argument: str = "frame") -> None:
