@@ -104,13 +104,13 @@ def _weighed(
 
 
 @jit_on_wide_vectors
-def started(sampler, keys, reals):
+def started(keys, sampler, reals):
     """The samples as particles of equal weight, in one component."""
     return single_component(jax.vmap(sampler.start)(keys, reals))
 
 
 @jit_on_wide_vectors
-def extended(sampler, key, samples, t):
+def extended(key, sampler, samples, t):
     """All samples after one more observation, weighted by it.
 
     A θ whose likelihood is no number gets the weight zero, and keeps it.
@@ -122,7 +122,7 @@ def extended(sampler, key, samples, t):
 
 
 @jit_on_wide_vectors
-def rejuvenated(sampler, key, samples, num_steps):
+def rejuvenated(key, sampler, samples, num_steps):
     """Samples of equal weight, from chains that start at resampled ones.
 
     Also the share of accepted steps, and how often a density was no number, by name.
@@ -157,7 +157,7 @@ def rejuvenated(sampler, key, samples, num_steps):
 
 
 @jit_on_wide_vectors
-def exchanged(sampler, key, samples, num_steps):
+def exchanged(key, sampler, samples, num_steps):
     """The samples with filters of this sampler's number of particles, weighted by what they change.
 
     The exchange step by importance sampling of Chopin, Jacob and Papaspiliopoulos (2013, section

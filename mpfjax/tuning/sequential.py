@@ -222,12 +222,12 @@ class _Run:
             return self.identity | identity_of("smc2", self.checkpoint, data, {})
 
         def start() -> State:
-            return like._replace(carry=(started(self.sampler, keys, reals), *like.carry[1:]))
+            return like._replace(carry=(started(keys, self.sampler, reals), *like.carry[1:]))
 
         run = LongRun("smc2", self.series.length, self.checkpoint, self.progress, identity)
         before = {"log_prior": 0, "log_marginal_likelihood": 0}
         if state is None:
-            samples = eqx.filter_eval_shape(started, self.sampler, keys, reals)
+            samples = eqx.filter_eval_shape(started, keys, self.sampler, reals)
             rows = (np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
             num_particles = self.sampler.problem.tree.num_particles
             like = State(0, (samples, num_particles, before), rows)
@@ -254,7 +254,7 @@ class _Run:
         samples, num_particles, invalid = carry
         counts, sampler = dict(invalid), self.sampler.with_particles(num_particles)
         keys = jax.random.split(jax.random.fold_in(self.key, step), 3)
-        samples, *numbers = extended(sampler, keys[0], samples, jnp.asarray(step, jnp.int32))
+        samples, *numbers = extended(keys[0], sampler, samples, jnp.asarray(step, jnp.int32))
         increment, size, num_invalid = map(float, numbers)
         counts["log_marginal_likelihood"] += int(num_invalid)
         rate = np.nan
@@ -263,13 +263,13 @@ class _Run:
             raise Broken(f"no sample has any likelihood{broken}")
         if size < _ESS_THRESHOLD * samples.num_particles:
             so_far = jnp.asarray(step + 1, jnp.int32)
-            samples, accepted, of_moves = rejuvenated(sampler, keys[1], samples, so_far)
+            samples, accepted, of_moves = rejuvenated(keys[1], sampler, samples, so_far)
             rate = float(accepted)
             counts = {name: count + int(of_moves[name]) for name, count in counts.items()}
             may_double = self.max_particles is not None and 2 * num_particles <= self.max_particles
             if may_double and rate < _ACCEPTANCE_THRESHOLD:
                 larger = self.sampler.with_particles(2 * num_particles)
-                with_larger, gain, _, dropped = exchanged(larger, keys[2], samples, so_far)
+                with_larger, gain, _, dropped = exchanged(keys[2], larger, samples, so_far)
                 counts["log_marginal_likelihood"] += int(dropped)
                 # Where no filter of 2N particles has any likelihood, those of N are kept.
                 if float(gain) > -np.inf:

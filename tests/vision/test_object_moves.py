@@ -7,11 +7,15 @@ import numpy as np
 
 from mpfjax import QuadraticModel, Step
 from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.regrouping.merge import Prune
 from mpfjax.vision.boxes.colour_model import BoxState
-from mpfjax.vision.boxes.hypotheses import ObjectExclusion
 
 NOW = Step(QuadraticModel(), np.float32(0.0))
+BY_OBJECT = {
+    "group": lambda states: states.reference,
+    "features": lambda states: states.box[:, :2],
+}
 # Component, reference, x, mass: object 0 has two hypotheses, object 1 has one near the first.
 ROWS = [(0, 0, 0.0, 0.2), (0, 0, 2.0, 0.2), (1, 0, 50.0, 0.1), (2, 1, 4.0, 0.3), (2, 1, 6.0, 0.2)]
 
@@ -30,7 +34,7 @@ def mixture_of(rows, num_components=4):
 
 def test_exclusion_by_hand():
     mixture = mixture_of(ROWS)
-    move = ObjectExclusion(strength=2.0, radius=0.5, scale=(10.0, 5.0))
+    move = Exclusion(strength=2.0, radius=0.5, scale=(10.0, 5.0), **BY_OBJECT)
     moved = eqx.filter_jit(move)(jax.random.key(0), mixture, NOW)
     penalty = np.asarray(mixture.log_weights - moved.log_weights)
     # Object 0 stands at 1 with 4/5 of its mass and at 50 with 1/5; object 1 at 5, all of it.
@@ -42,9 +46,8 @@ def test_exclusion_by_hand():
 
 def test_hypotheses_of_one_object_do_not_exclude_each_other():
     mixture = mixture_of([(0, 0, 0.0, 0.5), (1, 0, 0.5, 0.5)])
-    moved = eqx.filter_jit(ObjectExclusion(strength=3.0, radius=0.5, scale=1.0))(
-        jax.random.key(0), mixture, NOW
-    )
+    move = Exclusion(strength=3.0, radius=0.5, **BY_OBJECT)
+    moved = eqx.filter_jit(move)(jax.random.key(0), mixture, NOW)
     np.testing.assert_array_equal(np.asarray(moved.log_weights), np.asarray(mixture.log_weights))
 
 

@@ -1,4 +1,4 @@
-"""Rival hypotheses about objects: colours that are learned, and exclusion."""
+"""Rival hypotheses about objects, with colours that are learned."""
 
 import dataclasses
 from typing import Any
@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.checks import Positive, check, to_numbers
+from mpfjax.checks import check
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation, Step, is_missing
-from mpfjax.moves.objects.exclusion import AbstractExclusion
 from mpfjax.moves.regrouping.features import component_groups
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel, Seen
 from mpfjax.vision.colour.histograms import Histograms, normalise
@@ -102,48 +101,6 @@ class AdaptAppearance(AbstractPropagation):
         model: Any = now.model
         particles = model.learned(now.observation, mixture.particles, self.rate)
         return mixture.replace(particles=particles)
-
-
-class ObjectExclusion(AbstractExclusion):
-    """Lower the weights of particles near the probable places of other objects.
-
-        log-weight_i -= strength · Σ_m s_m exp(-|x_i - μ_m|² / (2 radius²))
-
-    The sum runs over the components m of other objects; μ_m is the mean of the propagated
-    particles, and s_m the component's share of its object's mass. The object of a component is the
-    reference that its particles carry (`BoxState`). Components of one object are rival hypotheses
-    and do not repel each other. Distances are in units of `scale`, the width and height of a box in
-    pixels.
-
-    This is NOT part of the exact recursion. Objects interact as in a Markov random field, but
-    through their means instead of their states. The marginal likelihood is biased (`approximate` is
-    true). Use it after `Propagate`, where look-alikes cross.
-    """
-
-    strength: Positive = eqx.field(static=True, kw_only=True)
-    radius: Positive = eqx.field(static=True, kw_only=True)
-    scale: tuple[float, ...] = eqx.field(static=True, converter=to_numbers("scale"), kw_only=True)
-
-    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
-        """Lower the weight of every particle according to its distance from the other objects."""
-        if is_missing(now):
-            return mixture
-        states, owners = mixture.particles, component_references(mixture)
-        centres = states.box[:, :2] / jnp.array([self.scale], states.box.dtype)
-        filled = mixture.occupied.astype(centres.dtype)[:, None]
-        counts = jnp.maximum(mixture.component_sums(filled), 1.0)
-        means = mixture.component_sums(filled * centres) / counts
-        # Of each component in the mass of its object.
-        masses = mixture.log_mixture_weights
-        rivals = jnp.where(owners[:, None] == owners[None], masses[None], -jnp.inf)
-        shares = jnp.where(mixture.active, masses - jax.nn.logsumexp(rivals, axis=1), -jnp.inf)
-        shares = jnp.exp(shares).astype(centres.dtype)
-        squares = jnp.sum((centres[:, None] - means[None]) ** 2, axis=-1)
-        nearness = shares[None] * self.nearness(squares)
-        others = states.reference[:, None] != owners[None]
-        total = jnp.sum(jnp.where(others, nearness, 0.0), axis=1)
-        penalty = self.strength * total.astype(mixture.log_weights.dtype)
-        return mixture.replace(log_weights=mixture.log_weights - penalty)
 
 
 def best_components(

@@ -24,11 +24,7 @@ from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.transforms import with_resampling
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
-from mpfjax.vision.boxes.hypotheses import (
-    AdaptAppearance,
-    LearnedColourModel,
-    ObjectExclusion,
-)
+from mpfjax.vision.boxes.hypotheses import AdaptAppearance, LearnedColourModel
 from mpfjax.vision.colour.bins import RGBColours
 
 NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
@@ -118,7 +114,7 @@ def objects_filters(
     learn = AdaptAppearance(rate=0.03)
     num_components = most_components(len(boxes))
     num_particles = PARTICLES_PER_HYPOTHESIS * num_components
-    exclusion = ObjectExclusion(strength=3.0, radius=0.35, scale=size)
+    exclusion = Exclusion(strength=3.0, radius=0.35, group=_object, features=_centre, scale=size)
     mixture = Filter(
         model,
         moves=[
