@@ -23,8 +23,7 @@ _FURTHEST_ROUND = 16.0
 _FEWEST_PLACES = 256
 # Logarithms and logits have no unit, and a parabola fits up to about one half.
 _LONGEST = 0.5
-_NUM_HALVINGS = 32
-_MOST_APART = 0.25
+_MOST_UNCERTAIN = 0.125
 
 
 @checked
@@ -48,9 +47,8 @@ def standard_errors(
     and for each try two for each number; usually two tries, at most ten.
 
     Arguments are those of `fit`. Noise in I makes the errors too large rather than too small. A
-    warning says if there are too few seeds: if the errors from one half of the seeds and those
-    from the other half differ by more than 25% (the root mean square of the logarithm, over many
-    ways to halve them). The errors from all seeds are then uncertain by about half of that.
+    warning says if there are too few seeds: if the standard error of one of the errors is more than
+    an eighth of it, by the delta method from what each seed adds to I.
 
     Returns None, with a warning, if I is not positive definite: away from a maximum, along a
     direction that the data do not determine, or with too few seeds. Raises `ValueError` for what
@@ -89,7 +87,7 @@ def errors_at(
         said = "the log marginal likelihood has no maximum here, or too few seeds to see it"
         warn(f"standard_errors: {said}", UserWarning)
         return None
-    _warn_of_noise(informations, of_seeds)
+    _warn_of_noise(informations, covariance, of_seeds)
     # By the Jacobian of the parameters on their own scale, laid out in the same order.
     _, shaped = ravel_pytree(problem.constrain(reals))
 
@@ -157,20 +155,16 @@ def _inverse(information: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"] 
     return np.linalg.inv(relative) * scales
 
 
-def _warn_of_noise(informations: Float[np.ndarray, "seeds d d"], of_seeds: str) -> None:
-    """Warn where errors from halves of the seeds differ, the worst of them, over many halvings."""
-    num_seeds = len(informations)
-    # Halves of one split differ a lot or a little by chance.
-    generator, squares = np.random.default_rng(0), []
-    for _ in range(_NUM_HALVINGS if num_seeds > 1 else 0):
-        halves = np.array_split(generator.permutation(num_seeds), [num_seeds // 2])
-        inverses = [_inverse(informations[half].mean(axis=0)) for half in halves]
-        variances = [np.inf if inverse is None else np.diagonal(inverse) for inverse in inverses]
-        with np.errstate(invalid="ignore"):
-            squares.append((np.log(variances[0] / variances[1]) / 2) ** 2)
-    apart = np.expm1(np.sqrt(np.max(sum(squares) / _NUM_HALVINGS))) if squares else np.nan
-    if apart <= _MOST_APART:
-        return
-    found = f"differ by {apart:.0%}" if np.isfinite(apart) else "may be no errors at all"
-    said = f"{num_seeds} seeds leave them uncertain: those of two halves {found}; raise {of_seeds}"
-    warn(f"standard_errors: {said}", UserWarning)
+def _warn_of_noise(
+    informations: Float[np.ndarray, "seeds d d"],
+    covariance: Float[np.ndarray, "d d"],
+    of_seeds: str,
+) -> None:
+    """Warn where errors are uncertain: by the delta method, from what each seed adds to them."""
+    num_seeds, scale = len(informations), np.diagonal(covariance)
+    of_each = np.einsum("ij,sjk,ki->si", covariance, informations, covariance) / scale
+    uncertain = of_each.std(axis=0, ddof=1).max() / 2 / num_seeds**0.5 if num_seeds > 1 else np.inf
+    if uncertain > _MOST_UNCERTAIN:
+        by = f" by {uncertain:.0%}" if num_seeds > 1 else ""
+        said = f"{num_seeds} seeds leave them uncertain{by}; raise {of_seeds}"
+        warn(f"standard_errors: {said}", UserWarning)
