@@ -71,18 +71,6 @@ def check_outputs(folder: Path, outputs: Iterable[str], inputs: dict[str, Any]) 
                 )
 
 
-def format_table(header: list[str], rows: list[list[str]]) -> str:
-    """A table in plain text, columns aligned to the right but for the first."""
-    widths = [max(len(line[i]) for line in [header, *rows]) for i in range(len(header))]
-
-    def format_line(cells: list[str]) -> str:
-        first, *rest = zip(cells, widths, strict=True)
-        return "  ".join([first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in rest)])
-
-    rule = "  ".join("-" * width for width in widths)
-    return "\n".join([format_line(header), rule, *map(format_line, rows)])
-
-
 def exit_status(run: Callable[[], None], arguments: Sequence[str] | None = ()) -> int:
     """Run a command: bad input is one line on the error stream and 2, an interruption 130.
 

@@ -54,6 +54,7 @@ _NOT_WITH = {
         "lost_seconds",
         "classes",
         "point_deviation",
+        "truth",
     ),
     "detect": ("min_score", "classes", "point_deviation"),
     "point_deviation": ("truth",),
@@ -201,7 +202,8 @@ def open_source(options: argparse.Namespace) -> Source:
     if not has_pixels:
         folder = path if path.is_dir() else sequence_of(path) or path
         info = read_sequence_info(folder)
-    truth, end = None if points else find_truth(folder, options.truth, first, last), last
+    unscored, end = points or options.box is not None, last
+    truth = None if unscored else find_truth(folder, options.truth, first, last)
     if rows is not None and not has_pixels:
         known = [rows[:, :6], *([] if truth is None else [truth.objects])]
         held = last_frame(info, *known)

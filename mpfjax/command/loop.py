@@ -22,9 +22,8 @@ from mpfjax.command.arguments import (
     open_source,
     read_boxes,
 )
-from mpfjax.console import Clock, format_table, peak_memory, write_json
+from mpfjax.console import Clock, peak_memory, write_json
 from mpfjax.metrics import multi_object_scores
-from mpfjax.metrics.tracking_scores import matches
 from mpfjax.vision.boxes.following import follow_boxes
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
@@ -52,7 +51,6 @@ class Results:
         self.num_frames = 0
         self.without_room = 0  # frames with more objects than there is room for
         self.left_out = 0  # detections that could not be tracked
-        self.drawn: np.ndarray | None = None  # the boxes of --box
 
     def add(self, tracks: Tracks) -> np.ndarray:
         """Keep a frame's tracks, and return its rows."""
@@ -86,7 +84,7 @@ class Results:
             "peak_memory_mb": round(peak_memory(), 1),
         }
         first = self.source.first
-        return summary | scores_of(rows[:, :6], self.source.truth, first, first + n - 1, self.drawn)
+        return summary | scores_of(rows[:, :6], self.source.truth, first, first + n - 1)
 
 
 def _with_sizes(rows: np.ndarray) -> np.ndarray:
@@ -94,28 +92,10 @@ def _with_sizes(rows: np.ndarray) -> np.ndarray:
     return rows if rows.shape[1] == 8 else np.insert(rows, [4, 4], 0.0, axis=1)
 
 
-def scores_of(
-    rows: np.ndarray, truth: Truth | None, first: int, last: int, drawn: np.ndarray | None
-) -> dict[str, float]:
-    """HOTA, MOTA and IDF1 of rows in these frames, where there is a truth.
-
-    Where boxes were drawn, only the objects in these boxes are scored.
-    """
+def scores_of(rows: np.ndarray, truth: Truth | None, first: int, last: int) -> dict[str, float]:
+    """HOTA, MOTA and IDF1 of rows in these frames, where there is a truth."""
     if truth is None or not np.any(truth.objects[:, 0] <= last):
         return {}
-    if drawn is not None:
-        start = truth.objects[truth.objects[:, 0] == first]
-        boxes, objects = matches(drawn, start[:, 2:])
-        if len(boxes) < len(drawn):
-            print(
-                f"scored: {len(boxes)} of {len(drawn)} boxes, those around an object of the truth",
-                file=sys.stderr,
-            )
-        if not len(boxes):
-            return {}
-        rows = rows[np.isin(rows[:, 1], boxes + 1)]
-        wanted = np.isin(truth.objects[:, 1], start[objects, 1])
-        truth = truth._replace(objects=truth.objects[wanted])
     try:
         scores = multi_object_scores(
             rows,
@@ -146,7 +126,7 @@ def run(options: argparse.Namespace) -> None:
                 box_files.write_tracks(options.out / name, results.all_rows())
             summary = results.summary()
             write_json(options.out / SUMMARY, summary)
-            print(_table(summary))
+            print(_line(summary))
             print(f"written to {options.out}")
 
 
@@ -161,7 +141,7 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
     if options.box is not None:
         if still is None:
             raise ValueError(f"--box: frame {source.first}, in which they are, cannot be decoded")
-        boxes = results.drawn = read_boxes(options, still)
+        boxes = read_boxes(options, still)
         return lambda stills: follow_boxes(stills or (), boxes, key=key)
     rows, deviation = None, options.point_deviation
     if source.rows is not None:
@@ -244,8 +224,9 @@ def _track(results: Results, start: Start) -> None:
                 collections.deque(written(tracked), maxlen=0)
 
 
-def _table(summary: dict[str, Any]) -> str:
-    columns = ["frames", "objects", "frames_per_second", "peak_memory_mb"]
-    columns += [name for name in SCORES if name in summary]
-    names = ["frames", "objects", "frames a second", "peak MB", *columns[4:]]
-    return format_table(names, [[f"{summary[column]:g}" for column in columns]])
+def _line(summary: dict[str, Any]) -> str:
+    """The numbers of the summary that are worth a look."""
+    names = {"frames_per_second": "frames a second", "peak_memory_mb": "MB at most"}
+    columns = ["frames", "objects", *names, *SCORES]
+    told = (f"{summary[name]:g} {names.get(name, name)}" for name in columns if name in summary)
+    return ", ".join(told)

@@ -244,26 +244,8 @@ def test_a_truth_that_will_not_do_ends_no_run(tmp_path, capsys):
         assert find_truth(tmp_path, None, 1, None) is None
     rows = two_walkers(2)
     write_tracks(tmp_path / "gt.txt", np.vstack([rows, rows[:1]]))
-    assert scores_of(rows, find_truth(tmp_path, None, 1, None), 1, 2, None) == {}
+    assert scores_of(rows, find_truth(tmp_path, None, 1, None), 1, 2) == {}
     assert "no HOTA, MOTA and IDF1: truth: id 1 has more than one box" in capsys.readouterr().err
-
-
-def test_drawn_boxes_are_scored_against_those_whom_they_were_drawn_around(tmp_path, capsys):
-    rows = two_walkers(3)
-    write_tracks(tmp_path / "gt.txt", rows)
-    truth = find_truth(tmp_path, None, 1, None)
-    second = rows[rows[:, 1] == 2]
-    tracked = second.copy()
-    tracked[:, 1] = 1  # the one track is that of the first box
-    perfect = dict.fromkeys(SCORES, 1.0)
-    assert scores_of(tracked, truth, 1, 3, second[:1, 2:]) == perfect
-    # A second box, around nobody, and its track do not count.
-    drawn = np.vstack([[40.0, 0, 5, 5], second[0, 2:]])
-    tracked = np.vstack([tracked, tracked])
-    tracked[:3, 1], tracked[3:, 2] = 2, 0.0
-    assert scores_of(tracked, truth, 1, 3, drawn) == perfect
-    assert capsys.readouterr().err.count("scored: 1 of 2 boxes") == 1
-    assert scores_of(tracked, truth, 1, 3, drawn[:1]) == {}
 
 
 # --- bad input -----------------------------------------------------------------------------------
