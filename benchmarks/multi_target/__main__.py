@@ -21,6 +21,7 @@ Into --out DIR go multi_target.json and multi_target.png, the first run of the f
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import cycle, product
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -139,15 +140,10 @@ def _scores(scene: Scene, found: Found, truth: np.ndarray) -> tuple[float, float
     """Distance, error of the number, and switches; NaN without labels."""
     there, is_there = told(truth)
 
-    metric = getattr(mpfjax.metrics, scene.score)
-
-    def of_step(places: Any, truths: Any, is_told: Any, is_there: Any) -> Any:
-        masks = {"estimate_mask": is_told, "truth_mask": is_there}
-        return metric(places, truths, cutoff=scene.cutoff, exponent=1.0, **masks).distance
-
-    places, there = np.float32(found.places), np.float32(there)
-    distances = jax.jit(jax.vmap(of_step))(places, there, found.is_told, is_there)
-    distance = np.mean(np.asarray(distances))
+    metric = partial(getattr(mpfjax.metrics, scene.score), cutoff=scene.cutoff, exponent=1.0)
+    steps = zip(found.places, there, found.is_told, is_there, strict=True)
+    distances = [metric(*sets, estimate_mask=a, truth_mask=b).distance for *sets, a, b in steps]
+    distance = np.mean(distances)
     error, switches = np.mean(np.abs(found.numbers - is_there.sum(axis=1))), np.nan
     if found.labels.size:
         shown = np.where(found.is_told[..., None], found.places, np.nan)

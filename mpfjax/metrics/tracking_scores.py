@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
 
 from mpfjax.checks import NotNegative, checked, optional, to_rows
 
@@ -116,12 +117,9 @@ def remove_ignored(
 
 def matches(boxes: np.ndarray, objects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The rows of boxes and of objects, matched one to one, that overlap (IoU) by half or more."""
-    from scipy.optimize import linear_sum_assignment
-
     shares = overlap(boxes, objects)
     shares[shares < 0.5 - _ROUNDING] = 0
-    # TrackEval's own solver, with the objects first as there: of equal sums it finds the same. That
-    # of `set_distances`, inside a program, would compile for each number of boxes.
+    # TrackEval's own solver, with the objects first as there: of equal sums it finds the same.
     owners, matched = linear_sum_assignment(-shares.T)
     real = shares[matched, owners] > 0
     return matched[real], owners[real]
