@@ -30,7 +30,7 @@ class SmoothedSums(eqx.Module):
     """Smoothed expectations of a sum over the trajectory, as of each step.
 
     - `sums`: leaves (t, ...), at step s the estimate of E[Σ_{r <= s} h(x_{r-1}, x_r) | y_1..y_s].
-      With a lag, each term is that of `terms`, as far as s goes.
+      With a lag, the sum of the first s of `terms`.
     - `terms`: leaves (t, ...), the estimates of E[h(x_{r-1}, x_r) | y_1..y_{min(r + lag, t)}] for
       every r; None without a lag.
     - `run`: the `FilterRun`, with nothing collected.
@@ -97,10 +97,9 @@ def _smooth(key, smoother, series, lag):
     step_keys = jax.random.split(key_steps, length)
     initial = first_mixture(key_initial, filter, series)
     kept = smoother._no_terms(initial.particles)
-    settled = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[2:], leaf.dtype), kept.means)
 
-    def advance(carry: tuple[ParticleMixture, "Terms", PyTree], step: PyTree) -> Any:
-        mixture, kept, settled = carry
+    def advance(carry: tuple[ParticleMixture, "Terms"], step: PyTree) -> Any:
+        mixture, kept = carry
         t, step_key, draw_key, now = step
         moved, info = step_or_predict(filter, step_key, mixture, now)
         kept, values = smoother._of_pasts(draw_key, now.inputs, mixture, moved, kept)
@@ -109,28 +108,22 @@ def _smooth(key, smoother, series, lag):
             kept = kept._replace(means=means)
         else:
             kept = jax.tree.map(lambda old, new: old.at[t % num_kept].set(new), kept, values)
-        averages = jax.tree.map(jax.vmap(moved.average), kept.means)
-        sums = jax.tree.map(lambda done, own: done + jnp.sum(own, axis=0), settled, averages)
-        # The next step overwrites term t - lag; zero while there is none yet.
-        last = (t + 1) % num_kept
-        oldest = jax.tree.map(lambda own: own[last], averages)
-        if lag is not None:
-            settled = jax.tree.map(jnp.add, settled, oldest)
-        oldest = Terms(oldest, kept.row(last).variances_in(moved))
-        return (moved, kept, settled), (sums, oldest, report_of(info))
+        # The sum, or term t - lag, which the next step overwrites; zero while there is none yet.
+        settled = kept.row((t + 1) % num_kept).estimates_in(moved)
+        return (moved, kept), (settled, report_of(info))
 
     keys = step_keys, jax.random.split(key_backward, length)
     steps = (jnp.arange(length, dtype=jnp.int32), *keys, series)
-    carry, outputs = jax.lax.scan(advance, (initial, kept, settled), steps)
-    final, kept, _ = carry
-    sums, oldest, reports = outputs
+    (final, kept), (settled, reports) = jax.lax.scan(advance, (initial, kept), steps)
+    run = run_of(initial, final, None, reports)
     if lag is None:
-        return SmoothedSums(sums, None, run_of(initial, final, None, reports))
+        return SmoothedSums(settled.means, None, run)
     rest = jax.vmap(lambda r: kept.row(r).estimates_in(final))(
         np.arange(length - lag, length) % num_kept
     )
-    terms = jax.tree.map(lambda done, rest: jnp.concatenate([done[lag:], rest]), oldest, rest)
-    return SmoothedSums(sums, terms.means, run_of(initial, final, None, reports), terms.variances)
+    terms = jax.tree.map(lambda done, rest: jnp.concatenate([done[lag:], rest]), settled, rest)
+    sums = jax.tree.map(lambda means: jnp.cumsum(means, axis=0), terms.means)
+    return SmoothedSums(sums, terms.means, run, terms.variances)
 
 
 class Terms(NamedTuple):
