@@ -1,10 +1,11 @@
-"""Track state, precision, recall, success and recovery rates of boxes, shared by commands.
+"""Track state, precision, recall, rates and distinct hypotheses of boxes, shared by commands.
 
 The measures of Smith and Gatica-Perez (2004), section 3.1, for one box of each object in each
 frame, E the estimated box and G the true one. Boxes are (x, y, w, h) with (x, y) the top-left
 corner, in pixels. All functions work under jit and vmap.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -71,6 +72,17 @@ def recovery_rate(
     to_come = jnp.cumsum(present[::-1].astype(jnp.int32), axis=0)[::-1]
     fine = track_states | ~(present & (to_come <= num_last))[None]
     return jnp.mean(jnp.all(fine, axis=1).astype(jnp.result_type(float)), axis=0)
+
+
+def uniqueness(states: Float[Array, "n objects d"]) -> Float[Array, " objects"]:
+    """U/N of each object: its distinct hypotheses as a share of all particles."""
+
+    def of_object(rows: Float[Array, "n d"]) -> Float[Array, ""]:
+        rows = rows[jnp.lexsort(rows.T)]
+        is_new = jnp.any(rows[1:] != rows[:-1], axis=1)
+        return (1.0 + jnp.sum(is_new)) / rows.shape[0]
+
+    return jax.vmap(of_object, in_axes=1)(states)
 
 
 def _share(area: Float[Array, "*batch"], boxes: Float[Array, "*#batch 4"]) -> Float[Array, "..."]:

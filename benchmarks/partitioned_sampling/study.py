@@ -12,7 +12,7 @@ from tqdm import tqdm
 import mpfjax
 from benchmarks.partitioned_sampling.rates import measure
 from benchmarks.partitioned_sampling.scenes import Scene
-from mpfjax.metrics.particle_scores import uniqueness
+from benchmarks.tracking_quality import uniqueness
 
 Order = tuple[int, ...] | None
 # A new filter is one more line: name -> (model, number of particles, order) -> filter.
@@ -45,7 +45,7 @@ class Collect(eqx.Module):
         """Of each object."""
         kept = {"boxes": mixture.average(self.boxes_of(self.model, mixture.particles))}
         if self.everything:
-            kept["uniqueness"] = uniqueness(mixture)
+            kept["uniqueness"] = uniqueness(mixture.particles.box)
             kept["variance"] = jnp.var(mixture.particles.box[:, :, :2], axis=0)
         return kept
 

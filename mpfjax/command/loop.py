@@ -31,7 +31,7 @@ from mpfjax.vision.files.sequences import Truth
 from mpfjax.vision.files.threads import read_ahead
 from mpfjax.vision.tracking.adapters import LEAST_ROOM, Rows
 from mpfjax.vision.tracking.background import BackgroundSubtraction
-from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv, opencv_on_one_thread
+from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv, opencv
 from mpfjax.vision.tracking.state import Tracks
 from mpfjax.vision.tracking.track import offline_rows, online_rows, track
 from mpfjax.vision.tracking.tracker import ObjectTracker
@@ -209,9 +209,10 @@ def _track(results: Results, start: Start) -> None:
             path, times = source.path, results.times
             read = frames.read_frames(path, source.first, source.last, times=times)
             stills = watched(opened.enter_context(read_ahead(read)))
-            # Detecting may be slow, and is best divided among processors.
-            if not (options.detect or options.box or options.no_colour) and has_opencv():
-                opened.enter_context(opencv_on_one_thread())
+            # Two threads take twice the processor's time for pictures as small as those of optical
+            # flow, and none less by the clock; what detects is best divided among processors.
+            if not options.detect and has_opencv():
+                opencv().setNumThreads(1)
         # Closed before the thread that reads ends: it may wait for a frame.
         tracked = with_rows(opened.enter_context(contextlib.closing(start(stills))))
         if has_video:

@@ -1,13 +1,12 @@
-"""Scores of weighted particles: of forecasts, and of how many differ."""
+"""Scores of forecasts by weighted particles."""
 
 from typing import Annotated
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import NOT_NEGATIVE, checked, real_array
-from mpfjax.mixture import ParticleMixture, flatten_states
+from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.observations import one_observation
 from mpfjax.models.steps import likelihoods
@@ -63,31 +62,3 @@ def log_score(
     values = likelihoods(model, observation, mixture.particles)
     joint = jnp.where(mixture.occupied, mixture.log_weights + values, -jnp.inf)
     return -log_sum_exp(joint)
-
-
-@checked
-def uniqueness(mixture: ParticleMixture) -> Float[Array, " objects"]:
-    """U/N of each object: its distinct hypotheses as a share of all particles.
-
-    Smith and Gatica-Perez (2004), section 3.1. Two particles hold the same hypothesis of object j
-    if its whole state is equal in both. Particles have leaves (n, J, ...); empty slots hold no
-    hypothesis. Pass it as `collect` to get it after every step. A weighted resampling within the
-    step lowers it for the objects that have moved, as in the paper's figure 4. Raises `ValueError`
-    for particles of other shapes.
-    """
-    distinct = jax.vmap(lambda states: _distinct_rows(states, mixture), in_axes=1)
-    return distinct(mixture.particles) / jnp.asarray(
-        mixture.num_usable_slots, mixture.log_weights.dtype
-    )
-
-
-def _distinct_rows(states: PyTree, mixture: ParticleMixture) -> Float[Array, ""]:
-    """How many different rows the filled slots hold."""
-    rows = flatten_states(states)
-    empty = ~mixture.occupied
-    # The last key of a lexicographic sort counts most: the empty slots come last.
-    order = jnp.lexsort((*rows.T, empty))
-    rows, filled = rows[order], ~empty[order]
-    is_new = jnp.any(rows[1:] != rows[:-1], axis=1)
-    is_first = jnp.concatenate([jnp.ones(1, bool), is_new])
-    return jnp.sum((is_first & filled).astype(mixture.log_weights.dtype))

@@ -94,10 +94,6 @@ class LogDensity(eqx.Module):
         """The parameters by name, on their own scale."""
         return self.problem.constrain(reals)
 
-    def unconstrain(self, parameters: Mapping[str, Any]) -> Reals:
-        """u of parameters by name."""
-        return self.problem.unconstrain(parameters, "parameters")
-
 
 @checked
 def log_density(

@@ -6,73 +6,61 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Checked, Count, checked
+from mpfjax.checks import Count, checked
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.steps import likelihoods, moved
 
 
-class LabelLikelihood(Checked):
+class LabelLikelihood(eqx.Module):
     """The conditional log likelihood of labels given their observations, for `maximise`.
 
-    It is the mean over labels of `label_log_posteriors`, in each step over `num_frames` frames that
-    its seed draws, or over all frames. Use it for a likelihood that is not normalised over y, such
-    as exp(-λ B²), on frames whose true states are known. The marginal likelihood of a filter only
-    rises as λ falls and has no maximum in λ; this objective has one.
+    Use it for a likelihood that is not normalised over y, such as exp(-λ B²), on frames whose true
+    states are known. The marginal likelihood of a filter only rises as λ falls and has no maximum
+    in λ; this objective has one.
 
     - `observations`: leading axis t.
     - `labels`: the true states: leaves (t, k, ...), k of them in each frame.
     - `candidates`: rival states of each: leaves (t, k, n, ...), such as `transition_candidates`.
-    - `num_frames`: drawn for a step, without replacement; None takes all. Static.
-
-    Raises `ValueError` for a `num_frames` below 1, and with the first call for one above t.
     """
 
     observations: PyTree
     labels: PyTree
     candidates: PyTree
-    num_frames: Count | None = eqx.field(static=True, default=None)
 
     def __call__(self, key: Key[Array, ""], model: AbstractStateSpaceModel) -> Float[Array, ""]:
         """The mean over labels, in nats; at most log(n + 1)."""
-        data = (self.observations, self.labels, self.candidates)
-        if self.num_frames is not None:
-            t = jax.tree.leaves(self.labels)[0].shape[0]
-            chosen = jax.random.choice(key, t, (self.num_frames,), replace=False)
-            data = jax.tree.map(lambda leaf: leaf[chosen], data)
-        return jnp.mean(label_log_posteriors(model, *data))
+        del key
+        return jnp.mean(self.log_posteriors(model))
 
+    def log_posteriors(self, model: AbstractStateSpaceModel) -> Float[Array, "t k"]:
+        """log p(x* | y) / q(x*) of every label, by Monte Carlo over its candidates.
 
-@checked
-def label_log_posteriors(
-    model: AbstractStateSpaceModel, observations: PyTree, labels: PyTree, candidates: PyTree
-) -> Float[Array, "t k"]:
-    """log p(x* | y) / q(x*) of every label, by Monte Carlo over its candidates.
+        With candidates x_1..x_n ~ q, the prior that they are drawn from, and x_0 = x* the label,
 
-    With candidates x_1..x_n ~ q, the prior that they are drawn from, and x_0 = x* the label,
+            log L(y | x*) - log (1 / (n + 1)) Σ_{i=0..n} L(y | x_i),
 
-        log L(y | x*) - log (1 / (n + 1)) Σ_{i=0..n} L(y | x_i),
+        is the log posterior density of the label relative to q. It is normalised over the state, so
+        a factor of L that does not depend on the state cancels: conditional maximum likelihood (for
+        tracking, Taycher, Demirdjian, Darrell and Shakhnarovich 2006). With the label in the sum it
+        is at most log(n + 1), and its mean over labels is a lower bound of the information that y
+        has on x* (van den Oord, Li and Vinyals 2018). If labels are right to a pixel only, the best
+        likelihood is about a pixel wide: λ has a finite best value.
 
-    is the log posterior density of the label relative to q. It is normalised over the state, so a
-    factor of L that does not depend on the state cancels: conditional maximum likelihood (for
-    tracking, Taycher, Demirdjian, Darrell and Shakhnarovich 2006). With the label in the sum it is
-    at most log(n + 1), and its mean over labels is a lower bound of the information that y has on
-    x* (van den Oord, Li and Vinyals 2018). If labels are right to a pixel only, the best
-    likelihood is about a pixel wide: λ has a finite best value.
+        Frames are taken one after the other and computed again for the derivative. So in memory
+        only the data grow with t.
+        """
 
-    Shapes are as in `LabelLikelihood`. Frames are taken one after the other and computed again for
-    the derivative. So in memory only the data grow with t.
-    """
+        @jax.checkpoint
+        def of_frame(data: tuple[PyTree, PyTree, PyTree]) -> Float[Array, " k"]:
+            observation, label, rivals = data
+            own = jax.tree.map(lambda leaf: leaf[:, None], label)
+            states = jax.tree.map(lambda *both: jnp.concatenate(both, axis=1), own, rivals)
+            k, n = jax.tree.leaves(states)[0].shape[:2]
+            flat = jax.tree.map(lambda leaf: leaf.reshape(k * n, *leaf.shape[2:]), states)
+            logs = likelihoods(model, observation, flat).reshape(k, n)
+            return logs[:, 0] - logsumexp(logs, axis=1) + jnp.log(jnp.asarray(n, logs.dtype))
 
-    @jax.checkpoint
-    def of_frame(data: tuple[PyTree, PyTree, PyTree]) -> Float[Array, " k"]:
-        observation, label, rivals = data
-        states = jax.tree.map(lambda a, b: jnp.concatenate([a[:, None], b], axis=1), label, rivals)
-        k, n = jax.tree.leaves(states)[0].shape[:2]
-        flat = jax.tree.map(lambda leaf: leaf.reshape(k * n, *leaf.shape[2:]), states)
-        logs = likelihoods(model, observation, flat).reshape(k, n)
-        return logs[:, 0] - logsumexp(logs, axis=1) + jnp.log(jnp.asarray(n, logs.dtype))
-
-    return jax.lax.map(of_frame, (observations, labels, candidates))
+        return jax.lax.map(of_frame, (self.observations, self.labels, self.candidates))
 
 
 @checked

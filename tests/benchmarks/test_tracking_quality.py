@@ -10,6 +10,7 @@ from benchmarks.tracking_quality import (
     recovery_rate,
     success_rate,
     track_state,
+    uniqueness,
 )
 
 G = jnp.array([10.0, 20.0, 40.0, 20.0])
@@ -55,3 +56,10 @@ def test_rates_by_hand():
     both = jnp.stack([STATES, ~STATES], axis=2)
     np.testing.assert_array_equal(success_rate(both), [0.25, 0.0])
     np.testing.assert_array_equal(recovery_rate(both), [0.75, 0.25])
+
+
+def test_hypotheses_differ_where_any_number_does():
+    states = np.zeros((6, 3, 2))
+    states[:, 0] = np.arange(12).reshape(6, 2)
+    states[:, 1, 1] = [1, 2, 1, 2, 1, 9]
+    np.testing.assert_allclose(uniqueness(jnp.asarray(states)), [1.0, 3 / 6, 1 / 6], rtol=1e-6)

@@ -12,7 +12,7 @@ import mpfjax
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.tuning import LabelLikelihood, Positive, maximise
-from mpfjax.tuning.labels import label_log_posteriors, transition_candidates
+from mpfjax.tuning.labels import transition_candidates
 from tests import switching
 
 
@@ -49,7 +49,7 @@ def data(num_frames, num_candidates, num_labels=1):
 def test_each_label_has_its_own_candidates():
     observations, labels, rivals = data(3, 5, num_labels=2)
     model = Unnormalised(lambda_=0.7)
-    found = np.asarray(label_log_posteriors(model, observations, labels[1:], rivals))
+    found = np.asarray(LabelLikelihood(observations, labels[1:], rivals).log_posteriors(model))
     for t in range(3):
         for k in range(2):
             states = np.concatenate([labels[1 + t, k][None], rivals[t, k]])
@@ -69,7 +69,7 @@ def test_of_a_conditionally_linear_model_labels_carry_moments():
     )
     rivals = transition_candidates(jax.random.key(0), model, labels, 50)
     last = jax.tree.map(lambda leaf: leaf[1:], labels)
-    found = label_log_posteriors(model, y[1:], last, rivals)
+    found = LabelLikelihood(y[1:], last, rivals).log_posteriors(model)
     latents = np.append(regimes[1], rivals.latent)
     means = np.concatenate([places[1], np.asarray(rivals.mean).reshape(50, 2)])[:, 0]
     variances = np.append(0.0, np.asarray(rivals.covariance)[..., 0, 0])
@@ -99,17 +99,6 @@ def test_the_scale_has_a_best_value_and_a_factor_of_y_none():
     slope = jax.grad(lambda model: objective(jax.random.key(0), model))(run.tuned)
     assert abs(float(slope.c)) < 1e-4
     assert abs(float(slope.lambda_)) < 0.02
-
-
-def test_frames_are_drawn_anew_at_every_step():
-    observations, labels, rivals = data(20, 4)
-    objective = LabelLikelihood(observations, labels[1:], rivals, num_frames=3)
-    everything = label_log_posteriors(Unnormalised(), observations, labels[1:], rivals)
-    keys = jax.random.split(jax.random.key(0), 400)
-    values = np.asarray(jax.jit(jax.vmap(objective, (0, None)))(keys, Unnormalised()))
-    error = values.std() / np.sqrt(400)
-    assert error > 0
-    assert abs(values.mean() - float(everything.mean())) < 4 * error
 
 
 def parabola(key, model):

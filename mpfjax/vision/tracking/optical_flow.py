@@ -1,8 +1,6 @@
 """The camera's motion from pixels: corners of what stands still, followed by OpenCV."""
 
-import contextlib
 import importlib.util
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -117,23 +115,6 @@ def reduced(frame: np.ndarray, factor: int) -> np.ndarray:
 def has_opencv() -> bool:
     """Whether OpenCV is installed."""
     return importlib.util.find_spec("cv2") is not None
-
-
-@contextlib.contextmanager
-def opencv_on_one_thread() -> Iterator[None]:
-    """Within the block OpenCV has one thread, in all of the process.
-
-    By default it divides each operation among all processors. With pictures as small as those of
-    `OpticalFlow`, two threads take nearly twice the processor's time, and none less by the clock.
-    Use it around a loop over frames, where nothing else needs OpenCV's threads.
-    """
-    cv2: Any = opencv()
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
 
 
 def opencv() -> Any:
