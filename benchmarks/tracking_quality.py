@@ -80,7 +80,7 @@ def uniqueness(states: Float[Array, "n objects d"]) -> Float[Array, " objects"]:
     def of_object(rows: Float[Array, "n d"]) -> Float[Array, ""]:
         rows = rows[jnp.lexsort(rows.T)]
         is_new = jnp.any(rows[1:] != rows[:-1], axis=1)
-        return (1.0 + jnp.sum(is_new)) / rows.shape[0]
+        return (1 + jnp.sum(is_new)) / rows.shape[0]
 
     return jax.vmap(of_object, in_axes=1)(states)
 
