@@ -157,7 +157,7 @@ def test_two_thousand_detections_leave_the_strongest():
     # Six in that frame fill the room.
     more = np.array([[4, -1, 10 * i, 40, 5, 5, 1] for i in range(4)], float)
     strong = np.concatenate([walks(), more])
-    with pytest.warns(RuntimeWarning, match="frame 4 has 2006, more than the 6 that there is room"):
+    with pytest.warns(RuntimeWarning, match="frame 4 has 2006, more than the 6 of max_detections"):
         run = tracked(None, np.concatenate([weak, strong]))
     assert_same(run, tracked(None, strong), same_rows=False)
 

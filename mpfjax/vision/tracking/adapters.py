@@ -154,16 +154,3 @@ def observed(
         warn(f"detections: {late} lie in frames after the last, {number}, and were left out")
     if next(coming, _END) is not _END or (isinstance(detector, Mapping) and number < last):
         warn(f"detections: go on after the last frame, {number}, and were left out")
-
-
-class Once:
-    """Warns of each kind of problem once, and not in every frame."""
-
-    def __init__(self) -> None:
-        self.said: set[str] = set()
-
-    def warn(self, kind: str, message: str) -> None:
-        """Warn, unless a warning of this kind was given before."""
-        if kind not in self.said:
-            self.said.add(kind)
-            warn(f"{message} (here and wherever else it is so)")

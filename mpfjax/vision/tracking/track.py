@@ -8,13 +8,12 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import Count, Finite, checked, one_of
+from mpfjax.checks import Count, Finite, checked, one_of, warn
 from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.files.frames import of_one_kind, read_frames
 from mpfjax.vision.files.threads import read_ahead
 from mpfjax.vision.tracking.adapters import (
     LEAST_ROOM,
-    Once,
     Rows,
     as_detector,
     first_step,
@@ -25,6 +24,8 @@ from mpfjax.vision.tracking.gaussian import CameraMotion
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
 from mpfjax.vision.tracking.state import Tracks
 from mpfjax.vision.tracking.tracker import ObjectTracker, advanced, coloured
+
+_STRONGEST = "; the strongest are kept (here and wherever else it is so)"
 
 
 @checked
@@ -134,7 +135,7 @@ def _seen(
     deviation: float | None,
 ) -> Iterator[_Seen]:
     """What does not depend on earlier tracks, frame by frame."""
-    once = Once()
+    is_said = False
     for number, still, detected in frames:
         found, motion = None, None
         size = frame_size if still is None else still.shape[:2]
@@ -144,13 +145,11 @@ def _seen(
             found = Found.of(detected, f"detections: frame {number}", size, deviation)
             if min_score is not None:
                 found = found.at(found.scores >= min_score)
-            if len(found.rows) > room:
-                once.warn(
-                    "detections",
-                    f"detections: frame {number} has {len(found.rows)}, more than the {room} that"
-                    " there is room for, max_detections; the strongest are kept",
-                )
-                found = found.at(slice(room))
+            if len(found.rows) > room and not is_said:
+                said = f"frame {number} has {len(found.rows)}, more than the {room}"
+                warn(f"detections: {said} of max_detections{_STRONGEST}")
+                is_said = True
+            found = found.at(slice(room))
             if use_colours and still is not None and deviation is None:
                 found = coloured(found, still)
         if flow is not None and still is not None:
@@ -162,16 +161,14 @@ def _seen(
 def _tracked(
     seen: Iterator[_Seen], tracker: ObjectTracker, ahead: bool
 ) -> Generator[Tracks, None, None]:
-    state, once = tracker.init(), Once()
+    state, is_said = tracker.init(), False
     with read_ahead(seen) if ahead else contextlib.nullcontext(seen) as coming:
         for number, found, motion, time in coming:
             state, tracks = advanced(tracker, state, found, motion, time)
-            if tracks.full:
-                once.warn(
-                    "objects",
-                    f"tracker: frame {number} has more objects than the {tracker.max_objects} that"
-                    " there is room for, max_objects; the strongest are kept",
-                )
+            if tracks.full and not is_said:
+                said = f"frame {number} has more objects than the {tracker.max_objects}"
+                warn(f"tracker: {said} of max_objects{_STRONGEST}")
+                is_said = True
             yield tracks
 
 
