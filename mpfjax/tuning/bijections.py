@@ -16,7 +16,7 @@ class AbstractTransform(Checked):
 
     @abc.abstractmethod
     def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The parameter, inside its domain whatever the real numbers are."""
+        """The parameter, or a stack of them, inside its domain whatever the real numbers are."""
 
     @abc.abstractmethod
     def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -91,14 +91,7 @@ class Problem(eqx.Module):
 
     def constrained_rows(self, reals: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Stacks of parameters, of any leading axes, on their own scale."""
-
-        def convert(name: str, u: np.ndarray) -> np.ndarray:
-            rows = jnp.asarray(u).reshape(-1, *np.shape(self.start()[name]))
-            values = np.asarray(jax.vmap(self.transforms[name].constrain)(rows))
-            leading = u.shape[: u.ndim - rows.ndim + 1]
-            return values.reshape(*leading, *values.shape[1:])
-
-        return {name: convert(name, np.asarray(u)) for name, u in reals.items()}
+        return jax.tree.map(np.asarray, self.constrain(jax.tree.map(jnp.asarray, reals)))
 
     def at(self, reals: Reals) -> Any:
         """The filter or model with these parameters."""
