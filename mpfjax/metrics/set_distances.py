@@ -138,9 +138,9 @@ def _paired(
     which the powers of those that compete are numbers that it can add. A distance of the cutoff, or
     one of more than all of these together, costs `most`: how much more makes no difference.
     """
-    width, (of_estimates, of_truths) = (np.shape(estimates) or (0,))[-1], masks
-    found = _marked("estimate", estimates, of_estimates, width)
-    there = _marked("truth", truths, of_truths, width)
+    of_estimates, of_truths = masks
+    found = _marked("estimate", estimates, of_estimates)
+    there = _marked("truth", truths, of_truths, found.shape[1])
     distances = np.minimum(cdist(found, there) / cutoff, 1.0)
     if np.isnan(distances).any():
         return np.full(min(distances.shape), np.nan), *distances.shape
@@ -154,7 +154,9 @@ def _paired(
         unit = largest
 
 
-def _marked(name: str, points: Any, mask: Any, width: int) -> Float[np.ndarray, "s d"]:
+def _marked(
+    name: str, points: Any, mask: Any, width: int | None = None
+) -> Float[np.ndarray, "s d"]:
     """The points of a set that its mask, if there is one, does not leave out."""
     points = to_rows(width, f"{name}s", points)
     if mask is None:

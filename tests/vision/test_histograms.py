@@ -49,11 +49,10 @@ def random_boxes(num):
 @pytest.mark.exactness
 @pytest.mark.parametrize(("num_bins", "num_parts"), [(30, 1), (16, 1), (7, 2), (256, 1)])
 @pytest.mark.parametrize("wide_counts", [False, True])
-@pytest.mark.parametrize("soon", [False, True])
-def test_counts_are_numpys(frame, num_bins, num_parts, wide_counts, soon):
+def test_counts_are_numpys(frame, num_bins, num_parts, wide_counts):
     boxes = random_boxes(60)
     boxes[:, 3] = np.round(boxes[:, 3])
-    table = integral_histogram(jnp.asarray(frame), RGBColours(num_bins), wide_counts, soon)
+    table = integral_histogram(jnp.asarray(frame), RGBColours(num_bins), wide_counts)
     counts = counted(table, jnp.asarray(boxes), num_parts)
     assert counts.shape == (60, num_parts, 3, num_bins)
     expected = np.stack([numpy_counts(frame, box, num_bins, num_parts) for box in boxes])

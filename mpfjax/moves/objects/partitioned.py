@@ -188,9 +188,9 @@ def as_orders(orders: Any) -> Any:
         return orders
     if isinstance(orders, Tracer):
         return jnp.atleast_2d(orders).astype(jnp.int32)
-    num_objects = np.shape(orders)[-1] if np.ndim(orders) else 0
-    table = to_rows(num_objects, "orders", orders)
-    if not table.size or not (np.sort(table, axis=1) == np.arange(num_objects)[None]).all():
+    table = to_rows(None, "orders", orders)
+    is_order = np.sort(table, axis=1) == np.arange(table.shape[1])[None]
+    if not np.ndim(orders) or not table.size or not is_order.all():
         raise ValueError(f"orders: {shown(orders)} is no permutation of objects from 0 on")
     return jnp.asarray(table, jnp.int32)
 

@@ -234,11 +234,11 @@ class ColourModel(AbstractBoxModel):
         distances = self.distances(counts, sides, *self.own(states))
         return -0.5 * distances / self.sigma**2
 
-    def prepare_observation(self, observation: Seen, soon: bool = False) -> IntegralHistogram:
+    def prepare_observation(self, observation: Seen) -> IntegralHistogram:
         """The frame's integral histogram; a model of several objects builds it only once."""
         if isinstance(observation, IntegralHistogram):
             return observation
-        return integral_histogram(observation, self.colours, self.wide_counts, soon)
+        return integral_histogram(observation, self.colours, self.wide_counts)
 
     def counts(self, observation: Seen, states: BoxState) -> tuple[Histograms, Histograms | None]:
         """Pixels of each colour in each box, and at its sides where `contrast` is positive."""

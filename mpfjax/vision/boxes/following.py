@@ -153,7 +153,7 @@ def follow_boxes(
     advance = jit_with(little, _advance_boxes)
     for t, still in enumerate(itertools.chain([first], stills)):
         # An array: each new Python number would compile anew.
-        counted = None if still is None else count(model, still, soon=True)
+        counted = None if still is None else count(model, still)
         mixture, tracks, growth = advance(filter, len(boxes), key, np.asarray(t), mixture, counted)
         yield jax.device_get(with_densities(tracks, growth))
 

@@ -78,21 +78,16 @@ class IntegralHistogram(eqx.Module):
 
 
 def integral_histogram(
-    frame: UInt8[Array, "h w 3"],
-    colours: AbstractColours,
-    wide_counts: bool = False,
-    soon: bool = False,
+    frame: UInt8[Array, "h w 3"], colours: AbstractColours, wide_counts: bool = False
 ) -> IntegralHistogram:
     """Build the integral histogram of an RGB frame, whose pixels `colours` sorts into bins.
 
     `wide_counts` counts in 32 bits, which takes two to four times as long, for boxes of 65 536
-    pixels or more. `soon` is for programs that XLA optimises little (`cpu_options`): a quarter of
-    the operations to compile, and no slower there, but by half in other programs. Raises
-    `ValueError` for a frame of one channel or not of eight bits.
+    pixels or more. Raises `ValueError` for a frame of one channel or not of eight bits.
     """
     check_frame(frame)
     height, width, _ = frame.shape
-    table = _table(frame, colours, wide_counts, soon)
+    table = _table(frame, colours, wide_counts)
     return IntegralHistogram(table, colours.num_channels, colours.num_bins, height, width)
 
 
@@ -121,8 +116,8 @@ def bhattacharyya(
     return jnp.clip(1 - jnp.sum(jnp.sqrt(histograms * references), axis=-1), 0.0, 1.0)
 
 
-@partial(jax.jit, static_argnames=("wide_counts", "soon"))
-def _table(frame, colours, wide_counts, soon):
+@partial(jax.jit, static_argnames="wide_counts")
+def _table(frame, colours, wide_counts):
     width = frame.shape[1]
     dtype = jnp.dtype(jnp.uint32 if wide_counts else jnp.uint16)
     columns = -(-(width + 1) // _BLOCK) * _BLOCK
@@ -131,15 +126,12 @@ def _table(frame, colours, wide_counts, soon):
     bins = jnp.pad(colours.bins(frame), padding, constant_values=-1)
     num_bins = _stored_bins(colours.num_bins, colours.num_channels)
     above = jnp.zeros((columns, colours.num_channels * num_bins), dtype)
-    counted = _one_hot if soon else _row_counts
 
     def add_row(above: Array, row: Array) -> tuple[Array, Array]:
-        below = above + counted(row, num_bins, dtype)
+        below = above + _one_hot(row, num_bins, dtype)
         return below, below
 
     table = jax.lax.scan(add_row, above, bins)[1]
-    if not soon:
-        return table
 
     def add_left(k: Int[Array, ""], table: Array) -> Array:
         return table.at[:, k].add(table[:, k - 1])
@@ -153,26 +145,9 @@ def _stored_bins(num_bins: int, num_channels: int) -> int:
     return -(-least // _BINS_STEP) * _BINS_STEP
 
 
-def _row_counts(row: Int[Array, "w channels"], num_bins: int, dtype: jnp.dtype) -> Array:
-    """Prefix sums along one row. Blocks unrolled in full: XLA's cumsum takes five times longer."""
-    width, num_channels = row.shape
-    blocks = _one_hot(row, num_bins, dtype).reshape(width // _BLOCK, _BLOCK, -1)
-    within = _running_sums([blocks[:, i] for i in range(_BLOCK)])
-    before = _running_sums([jnp.zeros_like(within[-1][0]), *within[-1][:-1]])
-    sums = jnp.stack(within, axis=1) + jnp.stack(before)[:, None]
-    return sums.reshape(width, num_channels * num_bins)
-
-
 def _one_hot(row: Int[Array, "w channels"], num_bins: int, dtype: jnp.dtype) -> Array:
     one_hot = (row[:, :, None] == jnp.arange(num_bins)[None, None]).astype(dtype)
     return one_hot.reshape(row.shape[0], -1)
-
-
-def _running_sums(terms: list[Array]) -> list[Array]:
-    sums = terms[:1]
-    for term in terms[1:]:
-        sums.append(sums[-1] + term)
-    return sums
 
 
 def box_edges(
