@@ -29,13 +29,13 @@ from tqdm import tqdm
 from benchmarks.coverage import coverage
 from benchmarks.harness import Count, Natural, Seed, command, data, table
 from benchmarks.visual_tracking.detected import follow_detected, make_mixtures, rows_of_tracks
+from benchmarks.visual_tracking.following import Snapshot, follow, track_rows
 from benchmarks.visual_tracking.pictures import NAMES, write_contact_sheet, write_video
 from benchmarks.visual_tracking.source import Source, open_source
 from mpfjax.console import check_outputs
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import BackgroundSubtraction, write_tracks
 from mpfjax.vision.boxes import recipes
-from mpfjax.vision.boxes.following import Snapshot, follow, track_rows
 from mpfjax.vision.files.frames import parse_range
 
 OF_TRACKING = ("HOTA", "MOTA", "IDF1")

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 import mpfjax
+from benchmarks.visual_tracking.following import Snapshot
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractPropagation
 from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
-from mpfjax.vision.boxes.following import Snapshot
 from mpfjax.vision.tracking.detections import Found
 from mpfjax.vision.tracking.gaussian import Gaussian, places_of, units
 from mpfjax.vision.tracking.track import offline_rows

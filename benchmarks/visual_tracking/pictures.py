@@ -7,8 +7,8 @@ import numpy as np
 
 from benchmarks.figures import draw_contact_sheet, draw_points, region
 from benchmarks.harness import write_figure
+from benchmarks.visual_tracking.following import Snapshot
 from benchmarks.visual_tracking.source import Source
-from mpfjax.vision.boxes.following import Snapshot
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
 

@@ -1,9 +1,7 @@
 """Computer vision: frames, boxes, colour histograms, detections, the object tracker."""
 
 from mpfjax.vision.boxes.colour_model import ColourModel as ColourModel
-from mpfjax.vision.boxes.following import follow as follow
 from mpfjax.vision.boxes.following import follow_boxes as follow_boxes
-from mpfjax.vision.boxes.following import track_rows as track_rows
 from mpfjax.vision.boxes.joint_colour import joint_colour_model as joint_colour_model
 from mpfjax.vision.boxes.recipes import PRESETS as PRESETS
 from mpfjax.vision.colour.bins import HSVColours as HSVColours

@@ -1,117 +1,24 @@
-"""Boxes drawn in the first frame, followed: one track for each, or snapshots of any filter."""
+"""Boxes drawn in the first frame, followed: one track for each."""
 
 import itertools
-from collections.abc import Generator, Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Generator, Iterable
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import CountOrZero, checked, to_rows
+from mpfjax.checks import checked, to_rows
 from mpfjax.filter import Filter, with_densities
-from mpfjax.models.observations import one_observation
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
 from mpfjax.operations.random import split_once
-from mpfjax.vision.boxes.hypotheses import LearnedColourModel, best_components, component_references
+from mpfjax.vision.boxes.hypotheses import LearnedColourModel, best_components
 from mpfjax.vision.boxes.recipes import objects_filters
-from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files.frames import of_one_kind
 from mpfjax.vision.tracking.state import Tracks
 
 _END = object()
-
-
-class Snapshot(NamedTuple):
-    """The state of several runs in one frame; for a single run, without the leading axis.
-
-    - `means`: (runs, m, 4), the mean box of each component, centre and size in pixels.
-    - `active`: (runs, m), which components are alive.
-    - `points`: (runs, n, 2), the centres of the particles.
-    - `labels`: (runs, n), the component of each particle, -1 in an empty slot.
-    - `references`: (runs, m), which of the given boxes each component is compared with
-      (`BoxState.reference`, its mean over the component); None where particles carry none.
-    """
-
-    means: Any
-    active: Any
-    points: Any
-    labels: Any
-    references: Any = None
-
-
-@checked
-def follow(
-    keys: Key[Array, " runs"], filter: Filter, frames: Iterable[UInt8[np.ndarray, "h w 3"]]
-) -> Iterator[Snapshot]:
-    """Run a filter of boxes online, once for each key, and yield a snapshot for each frame.
-
-    The filter's model has a method `boxes(states)`, as `ColourModel` does. A frame is read only
-    after the frame before it is done, so that frames may come from a camera. Raises `ValueError`
-    for anything but a filter and a stack of keys. Use it with the `PRESETS`, and `track_rows` to
-    make tracks of the snapshots.
-    """
-    mixtures = jax.vmap(filter.init)(keys)
-    for t, frame in enumerate(frames):
-        step = jnp.asarray(t)  # an array: a new Python number would compile again
-        mixtures, snapshot, increments = _advance(
-            keys, filter, step, mixtures, jnp.asarray(one_observation(frame))
-        )
-        yield jax.tree.map(np.asarray, with_densities(snapshot, jnp.max(increments)))
-
-
-@eqx.filter_jit
-def _advance(keys, filter, t, mixtures, frame):
-    def step(key, mixture):
-        step_key = jax.random.fold_in(key, t)
-        mixture, info = filter._step(step_key, mixture, frame)
-        places = filter.model.boxes(mixture.particles)
-        labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
-        means = mixture.component_averages(places)
-        carried = hasattr(mixture.particles, "reference")
-        references = component_references(mixture) if carried else None
-        snapshot = Snapshot(means, mixture.active, places[:, :2], labels, references)
-        return mixture, snapshot, info.log_likelihood_increment
-
-    # The frame is not mapped over, so its histogram is built once for all runs.
-    return jax.vmap(step)(keys, mixtures)
-
-
-@checked
-def track_rows(
-    snapshots: list[Snapshot],
-    run: CountOrZero = 0,
-    *,
-    first: CountOrZero = 1,
-    by_reference: bool = False,
-) -> Float[np.ndarray, "rows 6"]:
-    """Rows (frame, id, x, y, w, h) of one run: an id for each life of each component.
-
-    (x, y) is the top-left corner in pixels, as `write_tracks` takes it; the first snapshot is of
-    frame `first`. With `by_reference` the id is 1 for all components of the first given box, 2 for
-    those of the second and so on. Then an id may have several rows in a frame, one for each
-    hypothesis. Raises `ValueError` for a run or a frame that is not a whole number from 0 on, and
-    where snapshots have no references.
-    """
-    if by_reference and any(snapshot.references is None for snapshot in snapshots):
-        raise ValueError("by_reference: the snapshots are of particles without a reference")
-    rows, alive, next_id = [], {}, 1
-    for frame, snapshot in enumerate(snapshots, first):
-        for m, (mean, active) in enumerate(
-            zip(snapshot.means[run], snapshot.active[run], strict=True)
-        ):
-            if not active:
-                alive.pop(m, None)
-                continue
-            if by_reference:
-                alive[m] = 1 + int(snapshot.references[run][m])
-            elif m not in alive:
-                alive[m], next_id = next_id, next_id + 1
-            rows.append([frame, alive[m], *box_files.top_left(mean[None])[0]])
-    # Rounded as in the file, so that scores from the file are the same.
-    return np.round(np.array(rows, float).reshape(-1, 6), 3)
 
 
 @checked

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from mpfjax.vision.boxes.following import Snapshot, follow, track_rows
+from benchmarks.visual_tracking.following import Snapshot, follow, track_rows
 from mpfjax.vision.boxes.recipes import PRESETS
 from tests.marking import weekly
 
