@@ -213,7 +213,8 @@ def follow_detected(
         boxes = Detections(detector.detect(still)[:MAX_DETECTIONS])
         found = coloured(Found.of(boxes, f"detections: frame {t + 1}", still.shape[:2]), still)
         means = jax.tree.map(np.asarray, _moments(mixtures))
-        decided = [each.decide(means.at(run), found) for run, each in enumerate(deciders)]
+        of_runs = (Gaussian(*rows) for rows in zip(*means, strict=True))
+        decided = [each.decide(one, found) for one, each in zip(of_runs, deciders, strict=True)]
         seen = jax.tree.map(lambda *leaves: np.stack(leaves).astype(_kind(leaves[0])),
                             *(of_run for _, of_run in decided))  # fmt: skip
         mixtures, boxes, points, owner = _advance(filter, keys, jnp.asarray(t), mixtures, seen)
