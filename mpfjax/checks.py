@@ -187,11 +187,11 @@ def check_shape(shape: str, /, **arguments: Any) -> None:
 def to_rows(width: int | None, name: str, value: Any) -> np.ndarray:
     """The argument as rows of `width` numbers; a vector is one row, and an empty list is none."""
     rows = np.atleast_2d(np.asarray(_array_of_numbers(name, value), float))
-    width = rows.shape[-1] if width is None else width
+    columns = int(rows.shape[-1]) if width is None else width
     if rows.size == 0:
-        return np.zeros((0, width))
-    if rows.ndim != 2 or rows.shape[1] != width:
-        raise ValueError(f"{name}: shape {rows.shape} is not that of rows of {width} numbers")
+        return np.zeros((0, columns))
+    if rows.ndim != 2 or rows.shape[1] != columns:
+        raise ValueError(f"{name}: shape {rows.shape} is not that of rows of {columns} numbers")
     return rows
 
 
