@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, single_component
@@ -90,8 +90,7 @@ class SelectInitial(AbstractMove):
         if now.observation is None:
             return mixture
         start = self._selected(key, now, mixture.num_particles)
-        own = {name: getattr(mixture, name) for name in ("ancestor_indices", "memory")}
-        return start.replace(num_components=mixture.num_components, **own)
+        return start.replace(num_components=mixture.num_components, memory=mixture.memory)
 
     def num_fitting(self, log_weights: Float[np.ndarray, " n"]) -> float:
         """The effective number of draws that y_1 speaks for, told from the weights of the chosen.
@@ -116,15 +115,17 @@ class SelectInitial(AbstractMove):
             log_factors, log_scale = two_looks(keys[1], now, drawn)
             return drawn, log_factors.T, log_scale
 
+        def flat(leaf: Array) -> Array:
+            return leaf.reshape(-1, *leaf.shape[2:])
+
         if (num_rounds := self.num_draws // at_once) == 1:
             drawn, log_factors, _ = look(jnp.stack([key_drawn, key_look]))
         else:
             rounds = [jax.random.split(each, num_rounds) for each in (key_drawn, key_look)]
             drawn, log_factors, log_scales = jax.lax.map(look, jnp.stack(rounds, axis=1))
             log_factors += (log_scales - jnp.max(log_scales))[:, None, None]
-            flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
             drawn, log_factors = jax.tree.map(flat, (drawn, log_factors))
-        return chosen(key_kept, drawn, log_factors.T, n, in_order=self.noise == "rqmc")
+        return chosen(key_kept, drawn, log_factors.T, n, self.noise == "rqmc")
 
 
 def require_propagation(now: Step, what: str) -> None:
@@ -151,15 +152,12 @@ def chosen(
     key: Key[Array, ""],
     drawn: PyTree,
     log_factors: Float[Array, "2 k"],
-    num_slots: int,
-    number: Int[Array, ""] | None = None,
-    in_order: bool = False,
+    number: int,
+    in_order: bool,
 ) -> ParticleMixture:
     """Of many draws a few, kept with probabilities in proportion to ν and weighing 1 / ν.
 
-    They fill the first `number` slots, or all, in one component; the ancestors are their places
-    among the draws. The logarithm of their mass, of which 1 is the mean, is the mixture's
-    `log_scale`.
+    The logarithm of their mass, of which 1 is the mean, is the mixture's `log_scale`.
     """
     trust = stored(jax.lax.stop_gradient(trusted(log_factors, jnp.ones_like(log_factors[0]))))
     pool = single_component(drawn)
@@ -167,17 +165,14 @@ def chosen(
     weights = whole(trust if order is None else take(trust, order), 0.0)
     totals = jnp.sum(weights, keepdims=True)
     line = Line(pool.num_particles, weights, totals, jnp.zeros_like(totals), weights > 0, order)
-    targets = jnp.full(1, num_slots if number is None else number, jnp.int32)
-    kept = draw_ancestors(key, line, targets, "systematic", num_slots=num_slots)
-    trust = take(trust, kept.particles).astype(default_float())
+    targets = jnp.full(1, number, jnp.int32)
+    kept = draw_ancestors(key, line, targets, "systematic", num_slots=number).particles
     # No ν is below a quarter, so that their inverses need no logarithms to be summed.
-    filled = kept.slots.filled
-    total = jnp.sum(jnp.where(filled, 1 / trust, 0.0))
-    particles = jax.tree.map(lambda leaf: take(leaf, kept.particles), drawn)
+    trust = take(trust, kept).astype(default_float())
+    total = jnp.sum(1 / trust)
+    particles = jax.tree.map(lambda leaf: take(leaf, kept), drawn)
     return single_component(particles).replace(
-        log_weights=jnp.where(filled, -jnp.log(trust * total), -jnp.inf),
-        log_scale=jnp.log(total / targets[0].astype(total.dtype)),
-        ancestor_indices=kept.particles,
+        log_weights=-jnp.log(trust * total), log_scale=jnp.log(total / number)
     )
 
 
