@@ -41,8 +41,7 @@ class KMeans(AbstractRegrouping, ByFeatures):
         """Each particle to the component whose centroid is nearest."""
         features, occupied, m = self.features_of(mixture), mixture.occupied, mixture.num_components
         if self.reseed:
-            alive = jnp.ones(m, bool)
-            labels = nearest(features, farthest_first(features, occupied, m), alive)
+            labels = farthest_first(features, occupied, m)
         else:
             labels = mixture.component_indicators
         filled = jnp.where(occupied[:, None], features, 0.0)
@@ -58,30 +57,29 @@ class KMeans(AbstractRegrouping, ByFeatures):
 
 def farthest_first(
     features: Float[Array, "n k"], occupied: Bool[Array, " n"], num_seeds: int
-) -> Float[Array, "num_seeds k"]:
-    """Seeds for K-means: the particle farthest from the mean, then each farthest from all."""
+) -> Int[Array, " n"]:
+    """The nearest of so many seeds to each particle.
+
+    The first is the particle farthest from the mean, and each other the one farthest from all
+    before it.
+    """
     weight = occupied.astype(features.dtype)[:, None]
     mean = jnp.sum(weight * features, axis=0) / jnp.maximum(jnp.sum(weight), 1.0)
-
     everywhere = jnp.zeros(features.shape[0], jnp.int32)
-
-    def farthest(distance: Float[Array, " n"]) -> Float[Array, " k"]:
-        return features[segment_argmax(jnp.where(occupied, distance, -1.0), everywhere, 1)[0]]
-
-    def squared_distance(point: Float[Array, " k"]) -> Float[Array, " n"]:
-        return jnp.sum((features - point[None]) ** 2, axis=1)
+    nowhere_near = jnp.full(features.shape[0], jnp.inf, features.dtype)
 
     def add(
-        state: tuple[Float[Array, " n"], Float[Array, " k"]], _: None
-    ) -> tuple[tuple[Float[Array, " n"], Float[Array, " k"]], Float[Array, " k"]]:
-        distance, seed = state
-        distance = jnp.minimum(distance, squared_distance(seed))
-        return (distance, farthest(distance)), seed
+        i: Int[Array, ""], state: tuple[Float[Array, " k"], Float[Array, " n"], Int[Array, " n"]]
+    ) -> tuple[Float[Array, " k"], Float[Array, " n"], Int[Array, " n"]]:
+        point, least, labels = state
+        distance = row_sums((features - point[None]) ** 2)
+        labels = jnp.where(distance < least, jnp.maximum(i, 0).astype(labels.dtype), labels)
+        least = jnp.minimum(least, distance)
+        farthest = segment_argmax(jnp.where(occupied, least, -1.0), everywhere, 1)[0]
+        # The mean, which comes before them, is no seed.
+        return features[farthest], jnp.where(i < 0, jnp.inf, least), labels
 
-    first = farthest(squared_distance(mean))
-    nowhere_near = jnp.full(features.shape[0], jnp.inf, features.dtype)
-    _, seeds = jax.lax.scan(add, (nowhere_near, first), length=num_seeds)
-    return seeds
+    return jax.lax.fori_loop(-1, num_seeds, add, (mean, nowhere_near, everywhere))[2]
 
 
 def nearest(
