@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.checks import Checked, check, is_series, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.operations.random import split
 
 Gradient = Literal["none", "stop"]
 
@@ -148,6 +149,15 @@ def as_moves(moves: Any, name: str) -> Moves:
     for move in moves:
         check(Callable[..., Any], "a move, (key, mixture, now) -> mixture", **{name: move})
     return tuple(m if isinstance(m, AbstractMove) else FunctionMove(m) for m in moves)
+
+
+def in_turn(
+    key: Key[Array, ""], moves: Moves, mixture: ParticleMixture, now: Step | None
+) -> ParticleMixture:
+    """The mixture after the moves, one after the other, as at some steps of a run alone."""
+    for move_key, move in zip(split(key, len(moves)), moves, strict=True) if moves else ():
+        mixture = move(move_key, mixture, now)  # pyright: ignore[reportArgumentType]
+    return mixture.replace(in_order=False)
 
 
 def name_of(move: AbstractMove) -> str:

@@ -14,10 +14,10 @@ from mpfjax.moves.base import (
     Moves,
     Step,
     as_moves,
+    in_turn,
     is_missing,
     name_of,
 )
-from mpfjax.operations.random import split
 
 
 class Every(AbstractWrapper):
@@ -73,9 +73,6 @@ class Every(AbstractWrapper):
         mixture, runs = mixture.replace(memory=counted), steps == self.every
 
         def run() -> ParticleMixture:
-            moved: Any = mixture
-            for move_key, move in zip(split(key, len(self.moves)), self.moves, strict=True):
-                moved = move(move_key, moved, now)  # pyright: ignore[reportArgumentType]
-            return moved.replace(in_order=False)  # it is so at every k-th step alone
+            return in_turn(key, self.moves, mixture, now)
 
         return jax.lax.cond(runs, run, lambda: mixture)

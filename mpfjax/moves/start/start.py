@@ -13,7 +13,15 @@ from jaxtyping import Array, Float, Key
 from mpfjax.checks import Count, InnerShare
 from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
 from mpfjax.moves.alarm import SURPRISE, is_alarmed, over_all_islands
-from mpfjax.moves.base import AbstractMove, AbstractWrapper, Moves, Step, as_moves, is_missing
+from mpfjax.moves.base import (
+    AbstractMove,
+    AbstractWrapper,
+    Moves,
+    Step,
+    as_moves,
+    in_turn,
+    is_missing,
+)
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.moves.start.window import (
     Paths,
@@ -245,23 +253,14 @@ def with_step(window: Window, taken: Array, now: Step) -> Window:
     An observation that is missing is not present there.
     """
     length = window.present.shape[0]
-    is_full, place = taken == length, jnp.minimum(taken, length - 1)
-    window = jax.tree.map(lambda leaf: jnp.where(is_full, jnp.roll(leaf, -1, axis=0), leaf), window)
 
     def put(leaves: Array, leaf: Any) -> Array:
-        return leaves.at[place].set(jnp.asarray(leaf, leaves.dtype))
+        room = jnp.append(leaves, leaves[:1], axis=0)
+        filled = room.at[taken].set(jnp.asarray(leaf, leaves.dtype))
+        return jax.lax.dynamic_slice_in_dim(filled, (taken == length).astype(int), length)
 
-    observations = window.observations
-    if not is_missing(now):
-        observations = jax.tree.map(put, observations, now.observation)
-    inputs = jax.tree.map(put, window.inputs, inputs_of(now.model))
-    return Window(observations, inputs, put(window.present, not is_missing(now)))
-
-
-def in_turn(
-    key: Key[Array, ""], moves: Moves, mixture: ParticleMixture, now: Step
-) -> ParticleMixture:
-    """The mixture after the moves, one after the other."""
-    for move_key, move in zip(split(key, len(moves)), moves, strict=True) if moves else ():
-        mixture = move(move_key, mixture, now)
-    return mixture.replace(in_order=False)
+    observation = now.observation
+    if is_missing(now):
+        observation = jax.tree.map(lambda leaves: leaves[0], window.observations)
+    new = Window(observation, inputs_of(now.model), ~jnp.asarray(is_missing(now)))
+    return jax.tree.map(put, window, new)
