@@ -47,8 +47,10 @@ LEAST_PART, MOST_POWERS = 0.8, 64
 # Moves of the noise after each power of y_t, and the steps that those of x_0 may take there: one
 # takes t.
 NOISE_MOVES, PATH_STEPS = 6, 12
-# What a move leaves of the noise of a step.
-KEPT_NOISE = 0.7
+# Of the moves of x_0 those that are walks; the others are differences of two of the pilot.
+OF_WALKS = 0.4
+# What a move leaves of the noise of a step, and the least part of a deviation of x_0 in a walk.
+KEPT_NOISE, LEAST_SIZE = 0.7, 2.0**-8
 
 
 class Window(NamedTuple):
@@ -112,7 +114,7 @@ def observe(
     is_pilot = jnp.arange(number) >= n
     targets = jnp.array([n, number - n], jnp.int32)
     num_moves = NOISE_MOVES + jnp.maximum(PATH_STEPS // t, 1)
-    num_words = 4 + paths.noise.shape[2]
+    num_words = 4 + 2 * flatten_states(paths.places).shape[1] + paths.noise.shape[2]
 
     def resampled(key: Key[Array, ""], paths: Paths, log_weights: Float[Array, " n"]) -> Paths:
         most = jnp.where(is_pilot, jnp.max(log_weights[n:]), jnp.max(log_weights[:n]))
@@ -257,16 +259,19 @@ def _proposed(
 ) -> Paths:
     """The paths with other noise of step t at x_{t-1}, or with the same at another x_0.
 
-    x_0 moves by the difference of any two of the pilot, in one mode or in two: differential
-    evolution (ter Braak 2006). Half of the differences are short where x_0 has many numbers.
+    Steps of x_0 are walks of many sizes, in each coordinate another, and differences of any two of
+    the pilot, which lead from mode to mode.
     """
     (p, d), flat = pilot.shape, flatten_states(paths.places)
     to_places = jax.vmap(ravel_pytree(jax.tree.map(lambda leaf: leaf[0], paths.places))[1])
     kind, *pair = uniform_of(words[:3], pilot.dtype)
+    sizes, directions = words[3 : 3 + d], words[3 + d : 3 + 2 * d]
+    deviations = jnp.std(pilot, axis=0, keepdims=True)
+    walk = deviations * LEAST_SIZE ** uniform_of(sizes, pilot.dtype).T
+    walk *= normal_of(directions, pilot.dtype).T
     one, other = (take(pilot, (p * place).astype(jnp.int32)) for place in pair)
-    sizes = jnp.where(kind < 0.5, 1.0, min(1.0, 2 / d**0.5))[:, None]
-    places = to_places(flat + sizes * (one - other))
-    noise = _noise_of(model, paths.states, words[3:])
+    places = to_places(flat + select_rows(kind < OF_WALKS, walk, one - other))
+    noise = _noise_of(model, paths.states, words[3 + 2 * d :])
     if _is_of_noise(model):
         now = jax.lax.dynamic_index_in_dim(paths.noise, t - 1, 1, False)
         noise = KEPT_NOISE * now + np.sqrt(1 - KEPT_NOISE**2) * noise
