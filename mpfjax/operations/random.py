@@ -46,14 +46,8 @@ def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
 
 
 def split(key: Key[Array, "*keys"], num: int) -> Key[Array, " num"]:
-    """`jax.random.split`, the same ordinary keys in less time on a CPU; keys that are split stay.
-
-    A longer split starts with the same keys.
-    """
-    if key.ndim:
-        return key
-    keys = jax.random.split(fast_key(key), num)
-    return jax.random.wrap_key_data(jax.random.key_data(keys), impl=jax.random.key_impl(key))
+    """`jax.random.split`; keys that are split stay. A longer split starts with the same keys."""
+    return key if key.ndim else jax.random.split(key, num)
 
 
 def split_once(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
@@ -152,26 +146,12 @@ def _random_bits(key: UInt32[Array, " 2"], bit_width: int, shape: tuple[int, ...
     return on_platform(key, cpu=partial(_words, shape=shape), default=stock)
 
 
-def _split(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "*shape 2"]:
-    stock = partial(threefry_prng_impl.split, shape=shape)
-    if not 0 < math.prod(shape) < 2**32:
-        return stock(key)
-    return on_platform(key, cpu=partial(_keys, shape=shape), default=stock)
-
-
 @partial(jax.jit, static_argnames="shape")
 def _words(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "..."]:
     """The word of each position: both halves of its hash, xored."""
     index = jax.lax.iota(jnp.uint32, math.prod(shape)).reshape(shape)
     high, low = threefry(key, jnp.zeros_like(index), index)
     return high ^ low
-
-
-@partial(jax.jit, static_argnames="shape")
-def _keys(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "..."]:
-    """The key of each position: both halves of its hash, side by side."""
-    index = jax.lax.iota(jnp.uint32, math.prod(shape))
-    return _both_halves(key[0], key[1], index[:, None]).reshape(*shape, 2)
 
 
 def _both_halves(
@@ -214,7 +194,7 @@ def _rounds(
 _UNROLLED = define_prng_impl(
     key_shape=(2,),
     seed=threefry_prng_impl.seed,
-    split=_split,
+    split=threefry_prng_impl.split,
     random_bits=_random_bits,
     fold_in=threefry_prng_impl.fold_in,
     name="unrolled_threefry2x32",
