@@ -70,7 +70,9 @@ class Every(AbstractWrapper):
             return mixture
         steps = mixture.memory[self.name]["steps"] + 1
         counted = mixture.memory | {self.name: {"steps": steps % self.every}}
-        mixture, runs = mixture.replace(memory=counted), steps == self.every
+        # As after the moves, which run at every k-th step alone: both have one form.
+        mixture = mixture.replace(memory=counted, in_order=False)
+        runs = steps == self.every
 
         def run() -> ParticleMixture:
             return in_turn(key, self.moves, mixture, now)

@@ -7,6 +7,7 @@ import pytest
 
 import mpfjax
 from mpfjax import Every, KMeans, Merge, Propagate, Split
+from mpfjax.mixture import single_component
 from tests.registry import RandomLabels
 
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
@@ -113,3 +114,12 @@ def test_a_resampling_from_time_to_time_leaves_the_choice_of_x_0_alone():
     assert run.resampled[1]
     first = jax.tree.map(lambda leaf: leaf[0], run.collected)
     np.testing.assert_array_equal(first.ancestor_indices, np.arange(64))
+
+
+def test_particles_in_order_come_through():
+    """Both branches have one form, whatever moved the particles before."""
+    mixture = single_component(jnp.arange(6.0), 2).replace(in_order=True)
+    filter = mpfjax.Filter(MODEL, [Propagate(), Every(2, [RandomLabels()])], 6, 2)
+    memory = filter.moves[1].initial_memory(MODEL, 2)
+    moved = filter.moves[1](KEYS[0], mixture.replace(memory=memory), None)
+    np.testing.assert_array_equal(moved.particles, mixture.particles)
