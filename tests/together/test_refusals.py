@@ -444,8 +444,6 @@ REFUSED = (
      lambda: Filter(Batched(), [Propagate(gradient="stop")], 4)),
     ("Batched defines no transition_from_noise",
      lambda: Filter(Batched(), [Propagate(noise="rqmc")], 4)),
-    ("noise_dimension",
-     lambda: Filter(changed(Drift, noise_dimension=65), [Propagate(noise="rqmc")], 4)),
     ("inherits its transition_from_noise, which noise='rqmc' needs",
      lambda: Filter(changed(Drift, sample_transition=lambda self, key, x: x),
                     [Propagate(noise="rqmc")], 4)),
