@@ -283,15 +283,12 @@ class _OverParticles:
         return jax.vmap(self.function)(*args)
 
 
-def mapped(model: Any, function: Any, draws: bool = False) -> Any:
-    """A function of the particles from one in the terms of the model: of one, or of all.
-
-    With `draws` it is a draw, `(key, states)`.
-    """
+def mapped(model: Any, function: Any) -> Any:
+    """A function of the particles from one in the terms of the model: of one, or of all."""
     is_mapped = isinstance(function, _OverParticles) or not callable(function)
     if not isinstance(model, _PerParticleModel) or is_mapped:
         return function
-    return _OverParticles(function, draws)
+    return _OverParticles(function)
 
 
 def per_particle(model: Any) -> AbstractStateSpaceModel:
