@@ -41,6 +41,7 @@ from mpfjax.models.trial import simulate as simulate
 from mpfjax.moves.base import AbstractMarkovMove as AbstractMarkovMove
 from mpfjax.moves.base import AbstractMove as AbstractMove
 from mpfjax.moves.base import AbstractPropagation as AbstractPropagation
+from mpfjax.moves.base import AbstractProposal as AbstractProposal
 from mpfjax.moves.base import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves.base import AbstractResampling as AbstractResampling
 from mpfjax.moves.base import AbstractWrapper as AbstractWrapper
@@ -57,10 +58,9 @@ from mpfjax.moves.objects.tracks import Targets as Targets
 from mpfjax.moves.objects.tracks import number_distribution as number_distribution
 from mpfjax.moves.objects.tracks import targets as targets
 from mpfjax.moves.objects.tracks import track_table as track_table
+from mpfjax.moves.propagation.marginalised import PropagateMarginalised as PropagateMarginalised
 from mpfjax.moves.propagation.nested import PropagateNested as PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate as Propagate
-from mpfjax.moves.propagation.propagate import PropagateMarginalised as PropagateMarginalised
-from mpfjax.moves.propagation.proposals import AbstractProposal as AbstractProposal
 from mpfjax.moves.propagation.proposals import GaussNewtonProposal as GaussNewtonProposal
 from mpfjax.moves.propagation.proposals import NetworkProposal as NetworkProposal
 from mpfjax.moves.propagation.regimes import PropagateRegimes as PropagateRegimes

@@ -13,15 +13,15 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, checked, kinds, shown
+from mpfjax.memory import after_step
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import AbstractStateSpaceModel, replaced, with_inputs
+from mpfjax.models.base import AbstractStateSpaceModel, with_inputs
+from mpfjax.models.law import law_of
 from mpfjax.models.noise import Noise
 from mpfjax.models.observations import one_input, one_observation
-from mpfjax.moves.alarm import SURPRISE, hearing
 from mpfjax.moves.base import (
     AbstractMove,
     AbstractPropagation,
-    AbstractPropagationOfEach,
     Moves,
     Step,
     all_of,
@@ -29,7 +29,6 @@ from mpfjax.moves.base import (
     memory_of,
     name_of,
 )
-from mpfjax.moves.initial import sample_initial
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import split
@@ -92,7 +91,7 @@ class Filter(eqx.Module):
         if not any(move.weighs for move in self.moves):
             who = f"moves: {', '.join(map(name_of, self.moves)) or 'none'}"
             raise ValueError(f"{who} never weigh the particles by what is observed, as Propagate")
-        now = self._now(None)
+        now = self._now()
         for move in (*self.initial_moves, *self.moves):
             move.check(now, self.num_particles, self.num_components)
         memory_of(self.moves, self.model, self.num_components)
@@ -105,11 +104,6 @@ class Filter(eqx.Module):
     def approximate(self) -> bool:
         """Whether any move departs from the exact recursion."""
         return any(move.approximate for move in self.moves)
-
-    @property
-    def propagation(self) -> AbstractPropagationOfEach | None:
-        """The move by which x_t of one particle is drawn and weighed without a look at others."""
-        return propagation_of(self.moves)
 
     @property
     def weighs_initially(self) -> bool:
@@ -176,74 +170,76 @@ class Filter(eqx.Module):
 
     # Within a program.
 
-    def with_inputs(self, inputs: PyTree) -> "Filter":
-        """The filter at a step whose known inputs are u_t, which its model receives.
-
-        `step`, `predict` and the runners do this themselves. None leaves the filter as it is.
-        """
-        return replaced(self, model=with_inputs(self.model, inputs))
-
-    def _now(self, observation: PyTree, is_initial: bool = False) -> Step:
-        return Step(self.model, observation, self.propagation, is_initial)
-
-    @property
-    def _periods(self) -> PyTree:
-        as_floats = partial(jnp.asarray, dtype=default_float())
-        return jax.tree.map(as_floats, getattr(self.model, "periods", None))
+    def _now(
+        self, observation: PyTree = None, inputs: PyTree = None, is_initial: bool = False
+    ) -> Step:
+        """The step with this y_t and u_t."""
+        model = with_inputs(self.model, inputs)
+        return Step(model, observation, inputs=inputs, moves=self.moves, is_initial=is_initial)
 
     def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
-        return sample_initial(key, self.model, self.num_particles, self.initial_noise)
+        return law_of(self.model).sample_initial(key, self.num_particles, self.initial_noise)
 
     def _init(
-        self, key: Key[Array, "*keys"], observation: PyTree = None, particles: PyTree = None
+        self,
+        key: Key[Array, "*keys"],
+        observation: PyTree = None,
+        inputs: PyTree = None,
+        *,
+        particles: PyTree = None,
     ) -> ParticleMixture:
-        """x_0, of these particles if they are there."""
+        """The mixture of x_0, of these particles if they are there."""
         key_drawn, *keys = split(key, 1 + len(self.initial_moves))
         if particles is None:
             draw = self._sample_initial
             particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
         mixture = single_component(particles, self.num_components)
         mixture = mixture.replace(memory=memory_of(self.moves, self.model, self.num_components))
-        now = self._now(observation, is_initial=True)
+        now = self._now(observation, inputs, is_initial=True)
         for move_key, move in zip(keys, self.initial_moves, strict=True):
             mixture = move(move_key, mixture, now)
         if self.weighs_initially:
             mixture, log_mass = mixture.normalised(mixture)
             mixture = mixture.replace(log_scale=log_mass, waits=log_mass != 0)
-        return mixture.replace(periods=self._periods)
+        return mixture.replace(periods=periods_of(now.model))
 
     def _step(
-        self, key: Key[Array, "*keys"], mixture: ParticleMixture, observation: PyTree = None
+        self,
+        key: Key[Array, "*keys"],
+        mixture: ParticleMixture,
+        observation: PyTree = None,
+        inputs: PyTree = None,
     ) -> tuple[ParticleMixture, StepInfo]:
         """A step; without an observation it only predicts."""
-        now, mixture = self._now(observation), mixture.with_own_ancestors()
-        resampled = jnp.zeros(self.num_components, bool)
+        now, mixture = self._now(observation, inputs), mixture.at_step()
         increment = jnp.zeros((), mixture.log_weights.dtype)
         for move_key, move in zip(split(key, len(self.moves)), self.moves, strict=True):
             if self._keeps_parents and isinstance(move, AbstractPropagation):
                 mixture = mixture.with_parents()
             moved = check_result(move(move_key, mixture, now), mixture, move)
-            if observation is not None:
-                resampled |= move.would_resample(mixture, now)
-                if not move.keeps_mass:
-                    moved, log_growth = moved.normalised(mixture)
-                    increment += log_growth
+            if observation is not None and not move.keeps_mass:
+                moved, log_growth = moved.normalised(mixture)
+                increment += log_growth
             mixture = moved
-        mixture = mixture.replace(parents=None, in_order=False, periods=self._periods)
-        evidence = None
-        if SURPRISE in mixture.memory:
-            mixture, evidence = hearing(self.moves, mixture, now, increment)
-        return mixture, report_of(mixture, increment, resampled, evidence)
+        mixture, remembered = after_step(mixture, now, increment)
+        report = report_of(mixture, increment, **remembered)
+        return mixture.replace(within=None, periods=periods_of(now.model)), report
 
 
 @jit_with_floats_traced
 def _one_step(filter, key, mixture, observation, inputs):
-    return filter.with_inputs(inputs)._step(key, mixture, observation)
+    return filter._step(key, mixture, observation, inputs)
 
 
 @jit_with_floats_traced
 def _start(filter, keys, observation, inputs, particles):
-    return filter.with_inputs(inputs)._init(keys, observation, particles)
+    return filter._init(keys, observation, inputs, particles=particles)
+
+
+def periods_of(model: Any) -> PyTree:
+    """The periods of the state in floating point; None for a model without any."""
+    as_floats = partial(jnp.asarray, dtype=default_float())
+    return jax.tree.map(as_floats, getattr(model, "periods", None))
 
 
 def with_densities(value: PyTree, increments: Float[Array, "*runs_and_t"]) -> PyTree:
@@ -261,17 +257,6 @@ def with_densities(value: PyTree, increments: Float[Array, "*runs_and_t"]) -> Py
         at = f", first at index {step} of the steps" if broken.ndim else ""
         raise RuntimeError(f"{BROKEN_DENSITY}{at}")
     return value
-
-
-def propagation_of(moves: Moves) -> AbstractPropagationOfEach | None:
-    """The first move that propagates particles each on its own, also within a wrapper."""
-    for move in moves:
-        if isinstance(move, AbstractPropagationOfEach):
-            return move
-        held = None if isinstance(move, AbstractPropagation) else propagation_of(move.inner)
-        if held is not None:
-            return held
-    return None
 
 
 def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: str) -> None:

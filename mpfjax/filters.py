@@ -11,18 +11,18 @@ from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead
 from mpfjax.models.base import AbstractStateSpaceModel, mapped
-from mpfjax.models.conditionally_linear import is_marginalised, refuse_marginalised
+from mpfjax.models.conditionally_linear import is_marginalised
+from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.models.noise import Noise
 from mpfjax.models.targets import TargetsModel
-from mpfjax.moves.base import AbstractMove, AbstractResampling, Gradient, as_moves
+from mpfjax.moves.base import AbstractMove, AbstractProposal, AbstractResampling, Gradient, as_moves
 from mpfjax.moves.every import Every
 from mpfjax.moves.objects.bernoulli import Associate
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, Reassembly
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
-from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.moves.regrouping.features import OnCircles, Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
 from mpfjax.moves.regrouping.merge import Merge

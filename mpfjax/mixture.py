@@ -55,6 +55,21 @@ class MarginalisedState(NamedTuple):
     covariance: Float[Array, "*n d d"]
 
 
+class Within(eqx.Module):
+    """What a mixture carries from move to move within a step, and nowhere else.
+
+    - `parents`: x_{t-1} of each particle after the propagation, where a move of the chain asks for
+      it (`AbstractMove.needs_parents`).
+    - `resampled`: (m,), which of the components that the step began with have been resampled.
+    - `in_order`: whether a move has put each component's particles in an order, along which a
+      propagation that follows spreads its point sets.
+    """
+
+    resampled: Bool[Array, " m"]
+    parents: PyTree = None
+    in_order: bool = eqx.field(static=True, default=False)
+
+
 class ParticleMixture(eqx.Module):
     """P_t = {N, M, Π, X, W, C}, the particles of a mixture (Vermaak et al. 2003, section 3).
 
@@ -75,10 +90,8 @@ class ParticleMixture(eqx.Module):
     - `memory`: the memory that moves keep from step to step, by the move's name.
     - `usable_slots`: how many slots a move may fill, the first ones; None is all of them. Only
       `monte_carlo(..., slots=...)` sets it.
-    - `parents`: within a step, x_{t-1} of each particle after the propagation, where a move of the
-      chain asks for it (`AbstractMove.needs_parents`). Elsewhere it is None.
-    - `in_order`: within a step, whether a move has put each component's particles in an order,
-      along which a propagation that follows spreads its point sets.
+    - `t`: the number of steps; zero in a mixture of x_0. Within a step it is that step's number.
+    - `within`: what the moves of a step pass on to each other; None outside a step.
     - `log_scale`: the logarithm of a common factor of all weights. It is kept apart from ℓ, which
       would lose its digits if a log-likelihood of a million were added. After a step it is zero.
       In a mixture of x_0 it is what the initial moves leave to the first increment.
@@ -100,8 +113,8 @@ class ParticleMixture(eqx.Module):
     memory: dict[str, PyTree] = eqx.field(default_factory=dict)
     usable_slots: Int[Array, ""] | None = None
     log_scale: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), default_float()))
-    parents: PyTree = None
-    in_order: bool = eqx.field(static=True, default=False)
+    t: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), jnp.int32))
+    within: Within | None = None
     waits: Bool[Array, ""] | None = None
     periods: PyTree = None
 
@@ -211,6 +224,10 @@ class ParticleMixture(eqx.Module):
         weights = self.component_weights.astype(values.dtype)
         filled = jnp.where(along_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
         return self.component_sums(along_rows(weights, values) * filled)
+
+    def component_groups(self, groups: Int[Array, " n"]) -> Int[Array, " m"]:
+        """The group of each component, where the particles of each are of one."""
+        return jnp.round(self.component_averages(groups)).astype(jnp.int32)
 
     def component_means(self, periods: PyTree = None) -> PyTree:
         """The weighted mean of each component: every leaf (m, ...), NaN for a dead one.
@@ -378,18 +395,47 @@ class ParticleMixture(eqx.Module):
         own = self.replace(log_weights=self.log_weights + (self.log_scale - log_scale))
         slots = select_rows(is_new, *map(attrgetter(*_OF_SLOTS), (brought, own)))
         slots = dict(zip(_OF_SLOTS, slots, strict=True))
-        return own.replace(**slots, log_scale=log_scale, usable_slots=first + number)
+        joined = own.replace(**slots, log_scale=log_scale, usable_slots=first + number)
+        return joined._within(parents=None)
 
-    def with_own_ancestors(self) -> "ParticleMixture":
-        """The mixture whose particles are their own ancestors, as a step begins with it."""
+    def at_step(self) -> "ParticleMixture":
+        """The mixture at the beginning of a step, each particle its own ancestor."""
         own = jnp.arange(self.num_particles, dtype=jnp.int32)
         if num_islands() > 1:
             own += self.num_particles * island_index()
-        return self.replace(ancestor_indices=own, periods=None)
+        within = Within(resampled=jnp.zeros(self.num_components, bool))
+        return self.replace(ancestor_indices=own, t=self.t + 1, within=within, periods=None)
+
+    @property
+    def parents(self) -> PyTree:
+        """x_{t-1} of each particle within a step, after the propagation; None where not kept."""
+        return None if self.within is None else self.within.parents
+
+    @property
+    def in_order(self) -> bool:
+        """Whether a move of this step has put each component's particles in an order."""
+        return self.within is not None and self.within.in_order
 
     def with_parents(self) -> "ParticleMixture":
         """The mixture that keeps x_{t-1}, before a propagation; as it is if it keeps it already."""
-        return self if self.parents is not None else self.replace(parents=self.particles)
+        return self if self.parents is not None else self._within(parents=self.particles)
+
+    def with_resampled(self, due: Bool[Array, " m"]) -> "ParticleMixture":
+        """The mixture of a step in which these components have been resampled too."""
+        return self if self.within is None else self._within(resampled=self.within.resampled | due)
+
+    def with_resampled_of(self, other: "ParticleMixture") -> "ParticleMixture":
+        """The mixture in which only these components count as resampled, whatever was since."""
+        return self if other.within is None else self._within(resampled=other.within.resampled)
+
+    def with_order(self, in_order: bool) -> "ParticleMixture":
+        """The mixture of a step in which each component's particles are in an order, or not."""
+        return self._within(in_order=in_order)
+
+    def _within(self, **fields: PyTree) -> "ParticleMixture":
+        if self.within is None:
+            return self
+        return self.replace(within=dataclasses.replace(self.within, **fields))
 
     def at(self, slots: Int[Array, " k"]) -> "ParticleMixture":
         """The particles of these slots, with all that belongs to them.
@@ -406,7 +452,8 @@ class ParticleMixture(eqx.Module):
     def map_slots(self, function: Callable[[Array], Array]) -> "ParticleMixture":
         """The mixture after a function of each array that has an entry for each slot."""
         arrays = jax.tree.map(function, attrgetter(*_OF_SLOTS)(self))
-        return self.replace(**dict(zip(_OF_SLOTS, arrays, strict=True)))
+        mapped = self.replace(**dict(zip(_OF_SLOTS, arrays, strict=True)))
+        return mapped._within(parents=jax.tree.map(function, self.parents))
 
     def replace(self, **fields: PyTree) -> "ParticleMixture":
         """A copy with some fields changed."""
@@ -423,7 +470,7 @@ class ParticleMixture(eqx.Module):
             raise ValueError(f"mixture: a stack of {stack} mixtures has no property of one; {how}")
 
 
-_OF_SLOTS = ("particles", "log_weights", "component_indicators", "ancestor_indices", "parents")
+_OF_SLOTS = ("particles", "log_weights", "component_indicators", "ancestor_indices")
 
 
 def no_ancestors(mixture: ParticleMixture) -> Int[Array, " n"]:

@@ -6,9 +6,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.alarm import is_alarmed
-from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
-from mpfjax.operations.islands import num_islands
 
 
 class StepInfo(eqx.Module):
@@ -50,17 +47,10 @@ class StepInfo(eqx.Module):
 def report_of(
     mixture: ParticleMixture,
     increment: Float[Array, ""],
-    resampled: Bool[Array, " m"],
-    evidence_against: Float[Array, ""] | None,
+    **remembered: Array,
 ) -> StepInfo:
-    """The report of a step that ended in this mixture."""
-    degenerate = increment == -jnp.inf
-    of_evidence = of_masses = None
-    # Families may have members on several islands.
-    if EVE_INDICES in mixture.memory and num_islands() == 1:
-        variance = jnp.where(degenerate, jnp.inf, evidence_variance(mixture))
-        of_evidence = jnp.sqrt(jnp.maximum(variance, 0.0))
-        of_masses = jnp.sqrt(jnp.maximum(mass_variances(mixture), 0.0))
+    """The report of a step that ended in this mixture, with what its memories add."""
+    assert mixture.within is not None
     # It is a diagnosis: the gradient of a run need not go through it at every step.
     squares = jnp.sum(jnp.exp(2 * jax.lax.stop_gradient(mixture.log_weights)))
     sizes = mixture.component_effective_sample_sizes
@@ -69,11 +59,8 @@ def report_of(
         effective_sample_sizes=sizes,
         effective_sample_size=1 / squares,
         mixture_weights=mixture.mixture_weights,
-        resampled=resampled,
-        degenerate=degenerate,
+        resampled=mixture.within.resampled,
+        degenerate=increment == -jnp.inf,
         labels_ran_out=jnp.all(sizes > 0) & (mixture.num_components > 1),
-        log_marginal_likelihood_error=of_evidence,
-        mixture_weight_errors=of_masses,
-        log_evidence_against_start=evidence_against,
-        surprised=None if evidence_against is None else is_alarmed(mixture),
+        **remembered,
     )

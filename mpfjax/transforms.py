@@ -7,10 +7,12 @@ from typing import Any
 from mpfjax.checks import Count, InnerShare, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead, PilotLookahead
+from mpfjax.moves.alarm import WatchStart
 from mpfjax.moves.base import (
     AbstractMove,
     AbstractPropagation,
     AbstractPropagationOfEach,
+    AbstractProposal,
     AbstractRegrouping,
     all_of,
 )
@@ -18,12 +20,10 @@ from mpfjax.moves.every import Every
 from mpfjax.moves.initial import SelectInitial, require_propagation
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
-from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.moves.start.start import Begin, Start
-from mpfjax.moves.start.watch import WatchStart
 
 
 @checked
@@ -104,7 +104,7 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
     for a filter without `Propagate`. Use it where the likelihood is narrow and cheap, with four to
     sixteen draws.
     """
-    require_propagation(filter._now(None), "each particle draws")
+    require_propagation(filter._now(), "each particle draws")
 
     def nested(move: AbstractPropagationOfEach) -> AbstractPropagationOfEach:
         plain: Any = move.propagate if isinstance(move, PropagateNested) else move

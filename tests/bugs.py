@@ -39,8 +39,8 @@ BUGS = {
     ),
     "the proposal's density has the wrong sign": Bug(
         "moves/propagation/propagate.py",
-        "log_factors.append(log_transition(now.model, draws, previous) - log_density)",
-        "log_factors.append(log_transition(now.model, draws, previous) + log_density)",
+        "log_factors.append(law.log_transition(draws, previous) - log_density)",
+        "log_factors.append(law.log_transition(draws, previous) + log_density)",
         "tests/together/test_exact_answers.py -k guided",
     ),
     "MALA forgets its step back": Bug(

@@ -11,9 +11,8 @@ from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import real_array, shown
 from mpfjax.models.base import real_each, require, with_inputs
-from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.models.observations import Series, as_series
-from mpfjax.models.steps import likelihoods
 from mpfjax.operations.logarithms import log_or_nothing, log_sum_exp, softmax
 
 
@@ -121,7 +120,7 @@ def _grid_filter(model, series, grid, width, log_initial, state_shape):
         given = with_inputs(model, now.inputs)
         kernel = kernel_of(given) if shared is None else shared
         predicted = jnp.matmul(probabilities, kernel, precision="highest")
-        log_factors = likelihoods(given, now.observations, states)
+        log_factors = law_of(given).log_likelihood(now.observations, states)
         if now.present is not None:
             log_factors = jnp.where(now.present, log_factors, 0.0)
         log_joint = log_or_nothing(predicted) + log_factors

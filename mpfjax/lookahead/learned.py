@@ -17,9 +17,9 @@ from mpfjax.lookahead.twisted import PropagateTwisted, RegroupTwisted, Twist, Tw
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import is_made_of_noise, mapped, require_noise
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
+from mpfjax.models.law import law_of
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.observations import as_series
-from mpfjax.models.steps import noise_dimension
 from mpfjax.moves.base import AbstractRegrouping, name_of
 from mpfjax.moves.every import Every
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
@@ -105,7 +105,7 @@ def _knowing_nothing(
     states = jax.eval_shape(lambda key: with_moments(model, model.sample_initial(key, 2)), key)
     num_features = math.prod(jax.eval_shape(features, states).shape[1:])
     size, dtype = filter.num_components, noise_dtype(states)
-    noise = jax.eval_shape(lambda states: jnp.zeros(noise_dimension(model, states)), states)
+    noise = jax.eval_shape(lambda states: jnp.zeros(law_of(model).noise_dimension(states)), states)
     one = neutral(size, num_features, noise.shape[0], dtype)
     steps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length + 1, *leaf.shape)), one)
     initial = None

@@ -10,12 +10,10 @@ from jaxtyping import Array, Float, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require_noise
-from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.models.noise import noise_dtype
-from mpfjax.models.steps import likelihoods
-from mpfjax.moves.base import Given, Step
+from mpfjax.moves.base import AbstractProposal, Given, Step
 from mpfjax.moves.initial import trusted
-from mpfjax.moves.propagation.proposals import AbstractProposal
 
 
 class AbstractLookahead(Given):
@@ -58,7 +56,9 @@ class PilotLookahead(AbstractLookahead):
         states = mixture.particles
         ones = jnp.ones((mixture.num_particles, model.noise_dimension), noise_dtype(states))
         looks = [
-            likelihoods(model, now.observation, model.transition_from_noise(noise, states))
+            law_of(model).log_likelihood(
+                now.observation, model.transition_from_noise(noise, states)
+            )
             for noise in (ones, -ones)
         ]
         # Any ν is exact, so that its derivative is not needed.

@@ -12,9 +12,10 @@ from mpfjax.filter import Filter
 from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.lookahead.twisted import Twist
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import with_inputs
 from mpfjax.models.conditionally_linear import with_moments
+from mpfjax.models.law import law_of
 from mpfjax.models.observations import Series
-from mpfjax.models.steps import completed, made_of, noise_dimension, seen
 from mpfjax.running.scan import FilterRun
 
 # The effective number of particles for each coefficient of a regression.
@@ -42,7 +43,7 @@ def fit_lookahead(
 
     def back(after: LocalQuadratics, step: Any) -> tuple[LocalQuadratics, LocalQuadratics]:
         key, used, mixture, now = step
-        model = filter.with_inputs(now.inputs).model
+        model = with_inputs(filter.model, now.inputs)
         points = _draw_points(key, model, twist, used, after, mixture, now)
         fitted = _fit_step(points, used)
         # ν with a mean of 1 over the filtering distribution, and its floor, δ of that mean.
@@ -95,7 +96,7 @@ def _draw_points(
 ) -> _Points:
     """Draw every particle with equal frequency, so that none is lost, with noise from q_t."""
     num_experts, dimension = used.centres.shape
-    num_noises = noise_dimension(model, mixture.particles)
+    num_noises = law_of(model).noise_dimension(mixture.particles)
     num_coefficients = _num_coefficients(dimension + num_noises)
     needed = _PARTICLES_A_COEFFICIENT * num_coefficients
     copies = -(-2 * needed * num_experts // mixture.num_particles)
@@ -104,8 +105,8 @@ def _draw_points(
     features = twist.features_of(states)
     shape = (len(log_weights), num_noises + 1)
     noise, log_ratio = used.draw(jax.random.normal(key, shape, features.dtype), features)
-    unseen = completed(model, made_of(model, noise, states), states)
-    moved, log_factors = seen(model, now.observations, unseen)
+    unseen = law_of(model).complete(law_of(model).make(noise, states), states)
+    moved, log_factors = law_of(model).see(now.observations, unseen)
     log_likelihoods = sum(log_factors[1:], log_factors[0])
     if (present := now.present) is not None:
         log_likelihoods = jnp.where(present, log_likelihoods, 0.0)

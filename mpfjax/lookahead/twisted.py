@@ -14,7 +14,6 @@ from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.base import check_moved
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.noise import draw_noise, noise_dtype
-from mpfjax.models.steps import completed, made_of, noise_dimension, seen
 from mpfjax.moves.base import (
     AbstractMove,
     AbstractPropagation,
@@ -25,8 +24,6 @@ from mpfjax.moves.base import (
 )
 from mpfjax.moves.propagation.propagate import noise_of_slots
 from mpfjax.operations.logarithms import log_sum_exp
-
-STEP = "twisted"
 
 
 class Twist(AbstractLookahead):
@@ -43,9 +40,9 @@ class Twist(AbstractLookahead):
     initial: LocalQuadratics | None
     features: Callable[[PyTree], Array] = flatten_states
 
-    def next(self, mixture: ParticleMixture) -> LocalQuadratics:
-        """ψ of the step that takes the particles on from where they are."""
-        place = jnp.minimum(mixture.memory[STEP]["step"], self.steps.log_cap.shape[0] - 1)
+    def at(self, t: Int[Array, ""]) -> LocalQuadratics:
+        """ψ_t."""
+        place = jnp.minimum(t - 1, self.steps.log_cap.shape[0] - 1)
         return jax.tree.map(lambda leaf: leaf[place], self.steps)
 
     def features_of(self, states: PyTree) -> Float[Array, "n d"]:
@@ -53,9 +50,13 @@ class Twist(AbstractLookahead):
         features = jnp.asarray(self.features(states))
         return features.reshape(len(features), -1).astype(noise_dtype(states))
 
-    def log_factors(self, mixture: ParticleMixture, now: Step | None = None) -> Float[Array, " n"]:
-        """log ν of the next step, whatever y_t is."""
-        return self.next(mixture).log_normaliser(self.features_of(mixture.particles))
+    def log_factors(self, mixture: ParticleMixture, now: Step) -> Float[Array, " n"]:
+        """log ν_t(x_{t-1}), whatever y_t is."""
+        return self.log_normaliser(mixture.t, mixture)
+
+    def log_normaliser(self, t: Int[Array, ""], mixture: ParticleMixture) -> Float[Array, " n"]:
+        """log ν_t of the particles of x_{t-1}."""
+        return self.at(t).log_normaliser(self.features_of(mixture.particles))
 
 
 class TwistInitial(AbstractMove):
@@ -93,27 +94,18 @@ class PropagateTwisted(AbstractPropagation, AbstractWrapper):
 
     holds = ("move",)
 
-    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
-        """The number of steps so far."""
-        return {STEP: {"step": jnp.zeros((), jnp.int32)}}
-
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
         if is_missing(now):
-            return _counted(self.move(key, mixture, now))
-        model, previous = now.model, mixture.particles
-        dimension = noise_dimension(model, previous) + 1
+            return self.move(key, mixture, now)
+        law, previous = now.law, mixture.particles
+        dimension = law.noise_dimension(previous) + 1
         noise = noise_of_slots(key, self.move.noise, dimension, mixture)
-        psi = self.twist.next(mixture)
+        psi = self.twist.at(mixture.t)
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
-        made = completed(model, made_of(model, drawn, previous), previous)
-        states, log_factors = seen(model, now.observation, made)
-        return _counted(mixture.replace(particles=states).weighed(*log_factors, log_ratio))
-
-
-def _counted(mixture: ParticleMixture) -> ParticleMixture:
-    step = mixture.memory[STEP]["step"] + 1
-    return mixture.replace(memory=mixture.memory | {STEP: {"step": step}})
+        made = law.complete(law.make(drawn, previous), previous)
+        states, log_factors = law.see(now.observation, made)
+        return mixture.replace(particles=states).weighed(*log_factors, log_ratio)
 
 
 class RegroupTwisted(AbstractWrapper, AbstractRegrouping):
@@ -132,7 +124,7 @@ class RegroupTwisted(AbstractWrapper, AbstractRegrouping):
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
         """The move's indicators under the weights times ν_{t+1}."""
-        log_factors = self.twist.log_factors(mixture)
+        log_factors = self.twist.log_normaliser(mixture.t + 1, mixture)
         log_weights = mixture.weighed(log_factors).log_weights
         log_weights = log_weights - log_sum_exp(log_weights)
         return self.move.regroup(key, mixture.replace(log_weights=log_weights))

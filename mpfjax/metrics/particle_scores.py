@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, PyTree
 from mpfjax.checks import NOT_NEGATIVE, checked, real_array
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.law import law_of
 from mpfjax.models.observations import one_observation
-from mpfjax.models.steps import likelihoods
 from mpfjax.operations.logarithms import log_sum_exp
 
 
@@ -59,6 +59,6 @@ def log_score(
     shape.
     """
     observation = one_observation(observation)
-    values = likelihoods(model, observation, mixture.particles)
+    values = law_of(model).log_likelihood(observation, mixture.particles)
     joint = jnp.where(mixture.occupied, mixture.log_weights + values, -jnp.inf)
     return -log_sum_exp(joint)

@@ -16,8 +16,7 @@ from mpfjax.models.base import (
     replaced,
     with_inputs,
 )
-from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.models.steps import own_likelihoods
+from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.operations.logarithms import default_float, log_or_nothing
 from mpfjax.operations.stored import on_platform
 
@@ -106,7 +105,7 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
 
         def of_one(measurement: PyTree) -> Float[Array, " n"]:
             false = density(measurement) if callable(density) else density
-            values = own_likelihoods(self.object_model, measurement, states)
+            values = law_of(self.object_model).log_likelihood_of_draws(measurement, states)
             return values - jnp.log(false).astype(values.dtype)
 
         # On a CPU, each fills the vectors by itself.

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key, PyTree, Shaped, jaxtyped
 from mpfjax.checks import as_numbers, check_shape, shown
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models import gaussians
-from mpfjax.models.base import AbstractStateSpaceModel, check_moved, model_name
+from mpfjax.models.base import AbstractStateSpaceModel, check_moved, model_name, real_each
 from mpfjax.models.gaussians import (
     Gaussian,
     Linear,
@@ -25,7 +25,10 @@ from mpfjax.models.gaussians import (
     solve_upper,
     transposed,
 )
+from mpfjax.models.law import Law
+from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.logarithms import default_float
+from mpfjax.operations.random import normal
 
 
 class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
@@ -83,6 +86,11 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
 
     handles_missing = True
 
+    @property
+    def law(self) -> Any:
+        """The class of the model's law."""
+        return MixedLaw if is_mixed(self) else MarginalisedLaw
+
     @abc.abstractmethod
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """Draw z_0 for `num_particles` particles: every leaf has shape (n, ...)."""
@@ -108,18 +116,76 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
         return observation
 
 
+class MarginalisedLaw(Law):
+    """The law of a conditionally linear model: z_t is random, and x_t has moments given z."""
+
+    is_whole = False
+
+    def part(self, states: PyTree) -> PyTree:
+        """z."""
+        return states.latent
+
+    def complete(self, draws: PyTree, states: PyTree) -> PyTree:
+        """z_t with the moments of x_t predicted."""
+        return predicted(self.model, draws, states)
+
+    def start(self, draws: PyTree) -> PyTree:
+        """z_0 with the moments of x_0."""
+        return with_moments(self.model, draws)
+
+    def see(self, observation: PyTree, states: PyTree) -> tuple[PyTree, list[Float[Array, " n"]]]:
+        """The moments given y_t too, and the factors of z and of x."""
+        log_factors = [self.log_likelihood_of_draws(observation, states.latent)]
+        states, log_density = updated(self.model, observation, states)
+        if log_density is not None:
+            number = states.mean.shape[0]
+            log_factors.append(real_each(log_density, number, self.model, "emission"))
+        return states, log_factors
+
+
+class MixedLaw(MarginalisedLaw):
+    """The law of a conditionally linear model whose z_t depends on x_{t-1}; z_t is then normal."""
+
+    has_density = True
+
+    @property
+    def is_of_noise(self) -> bool:
+        """True: z_t is normal."""
+        return True
+
+    def draw(self, key: Key[Array, ""], states: PyTree) -> PyTree:
+        """z_t, drawn from its normal law."""
+        return self.make(normal(key, states.latent.shape, noise_dtype(states)), states)
+
+    def make(self, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
+        """z_t, made of this standard normal noise."""
+        return latent_from_noise(self.model, noise, states)
+
+    def noise_dimension(self, states: PyTree) -> int:
+        """k, the number of coordinates of z_t."""
+        return latent_rows(self.model, states.latent).shape[0]
+
+    def log_transition(self, draws: PyTree, states: PyTree) -> Float[Array, " n"]:
+        """log p(z_t | z_{t-1}, y_1..y_{t-1})."""
+        return log_latent_density(self.model, draws, states)
+
+
+def log_predictive(
+    model: Any, observation: PyTree, latent: PyTree, state: MarginalisedState
+) -> Float[Array, " n"]:
+    """log p(y_t | z_t, z, y_1..y_{t-1}) of each particle, what is seen of z_t included."""
+    log_density = model.law(model).log_likelihood_of_draws(observation, latent)
+    emission = emission_of(model, latent, state)
+    if emission is None:
+        return log_density
+    law = predicted_gaussian(model, latent, state)
+    rows = observation_rows(model, observation, emission, state.mean.dtype)
+    return log_density + gaussians.update(law, rows, emission)[1]
+
+
 def is_marginalised(model: Any) -> bool:
     """Whether the model's particles carry moments in place of draws."""
     return isinstance(model, AbstractConditionallyLinearModel)
-
-
-def refuse_marginalised(
-    model: Any, needed_by: str, instead: str = "take PropagateMarginalised", name: str = "model"
-) -> None:
-    """Raise a `ValueError` for a conditionally linear model, which is not propagated as a whole."""
-    if is_marginalised(model):
-        who = f"{name}: {model_name(model)} is conditionally linear"
-        raise ValueError(f"{who}, and {needed_by} needs states drawn as a whole; {instead}")
 
 
 def is_mixed(model: Any) -> bool:

@@ -20,7 +20,7 @@ from mpfjax.models.base import (
     replaced,
     with_inputs,
 )
-from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.law import refuse_marginalised
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.random import split
 from mpfjax.operations.rows import select_rows

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from mpfjax.checks import as_numbers, check, check_shape, warn
 from mpfjax.models.base import model_name, takes_inputs
-from mpfjax.models.conditionally_linear import is_marginalised
+from mpfjax.models.law import law_of
 
 
 class Series(eqx.Module):
@@ -176,7 +176,7 @@ def refused_by(model: Any) -> str:
     """What of an observation the model is not given: a Kalman filter takes NaN, but no infinity."""
     if not getattr(model, "handles_missing", False):
         return NOT_FINITE
-    return "infinite" if is_marginalised(model) else ""
+    return "infinite" if not law_of(model).is_whole else ""
 
 
 def _steps_where(arrays: PyTree, combine: str, holds: Callable[[Any, Any], Any]) -> Any:

@@ -26,8 +26,8 @@ from mpfjax.models.base import (
     with_inputs,
 )
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
+from mpfjax.models.law import law_of
 from mpfjax.models.observations import one_input, one_observation, steps_of_inputs
-from mpfjax.models.steps import drawn_part, likelihoods, log_transition, moved
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 _KEYS, _PLACES, _DRAWS = 64, 4, 32  # of the draws that must differ
@@ -100,8 +100,18 @@ def _initial(key: Key[Array, ""], model: Any, number: int) -> PyTree:
 
 _for_each_key = partial(eqx.filter_vmap, in_axes=(0, None, None))
 _places, _many_initial = eqx.filter_jit(_initial), eqx.filter_jit(_for_each_key(_initial))
-_moved, _many_moved = eqx.filter_jit(moved), eqx.filter_jit(_for_each_key(moved))
-_likelihoods = eqx.filter_jit(likelihoods)
+
+
+def _move(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:
+    return law_of(model).move(key, states)
+
+
+_moved, _many_moved = eqx.filter_jit(_move), eqx.filter_jit(_for_each_key(_move))
+
+
+@eqx.filter_jit
+def _likelihoods(model: Any, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
+    return law_of(model).log_likelihood(observation, states)
 
 
 def _of_draws(method: str, draws: PyTree) -> Iterator[str]:
@@ -180,7 +190,7 @@ def _warn_of_derivative(model: Any, observation: PyTree, states: PyTree, where: 
 @eqx.filter_jit
 def _derivative(model, observation, states):
     def total(model: Any) -> Array:
-        values = likelihoods(model, observation, states)
+        values = law_of(model).log_likelihood(observation, states)
         return jnp.sum(jnp.where(jnp.isfinite(values), values, 0.0))
 
     return eqx.filter_grad(total)(model)
@@ -195,11 +205,11 @@ def _of_families(key, model, states):
     def of_family(family: tuple[Key[Array, "2"], PyTree]) -> tuple[Float[Array, "s s"], PyTree]:
         keys, state = family
         one = jax.tree.map(lambda leaf: jnp.repeat(leaf[None], _SIBLINGS, axis=0), state)
-        parents = moved(keys[0], model, one)
-        children = moved(keys[1], model, parents)
-        pair = [jax.tree.map(lambda leaf: leaf[rows], drawn_part(model, children))]
+        parents = law_of(model).move(keys[0], one)
+        children = law_of(model).move(keys[1], parents)
+        pair = [jax.tree.map(lambda leaf: leaf[rows], law_of(model).part(children))]
         pair += [jax.tree.map(lambda leaf: leaf[columns], parents)]
-        return log_transition(model, *pair).reshape(_SIBLINGS, _SIBLINGS), parents
+        return law_of(model).log_transition(*pair).reshape(_SIBLINGS, _SIBLINGS), parents
 
     keys = [jax.random.split(key, _FAMILIES) for key in (key_parents, key_children)]
     return jax.lax.map(of_family, (jnp.stack(keys, 1), states))

@@ -9,11 +9,12 @@ from typing import Any, ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import Checked, check, is_series, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.law import Law, law_of
 from mpfjax.operations.random import split
 
 Gradient = Literal["none", "stop"]
@@ -22,15 +23,31 @@ Gradient = Literal["none", "stop"]
 class Step(eqx.Module):
     """What a move is given of the step that it takes part in: `move(key, mixture, now)`."""
 
-    model: AbstractStateSpaceModel
-    """the filter's own model, at u_t."""
+    model: Any
+    """the filter's own model, an `AbstractStateSpaceModel` at u_t."""
     observation: PyTree = None
     """y_t; None where it is missing, and most moves then do nothing."""
-    propagation: "AbstractPropagationOfEach | None" = None
-    """how the filter itself draws and weighs x_t of a particle, `(key, mixture, now) -> mixture`;
-    None where no move of its chain can."""
-    is_initial: bool = eqx.field(static=True, default=False)
+    inputs: PyTree = eqx.field(default=None, kw_only=True)
+    """u_t, the known inputs of the step, from which the model at u_t was made."""
+    moves: "Moves" = eqx.field(default=(), kw_only=True)
+    """the filter's own chain."""
+    is_initial: bool = eqx.field(static=True, default=False, kw_only=True)
     """whether it is x_0 that is moved, with y_1 for an observation, if that is known."""
+
+    @property
+    def is_present(self) -> bool:
+        """Whether there is an observation."""
+        return self.observation is not None
+
+    @property
+    def propagation(self) -> "AbstractPropagationOfEach | None":
+        """The move by which the filter draws and weighs x_t of one particle; None without one."""
+        return propagation_of(self.moves)
+
+    @property
+    def law(self) -> Law:
+        """The law of a step of the model."""
+        return law_of(self.model)
 
 
 class Given(Checked):
@@ -82,10 +99,6 @@ class AbstractMove(Given):
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model or numbers of a filter that it cannot work with."""
 
-    def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
-        """Which components the move would resample, for the report of a step; most moves none."""
-        return jnp.zeros(mixture.num_components, bool)
-
     def initial_memory(
         self, model: AbstractStateSpaceModel, num_components: int
     ) -> dict[str, PyTree]:
@@ -96,12 +109,6 @@ class AbstractMove(Given):
         """The move in conditional SMC, which keeps one trajectory, a `Reference`; most cannot."""
         who = f"filter: {type(self).__name__}"
         raise ValueError(f"{who} cannot keep a trajectory, as Resample and Propagate can")
-
-    def evidence_against(
-        self, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
-    ) -> Float[Array, ""] | None:
-        """The report's `log_evidence_against_start` after a step; None of a move that has none."""
-        return None
 
     @property
     def inner(self) -> "Moves":
@@ -157,7 +164,7 @@ def in_turn(
     """The mixture after the moves, one after the other, as at some steps of a run alone."""
     for move_key, move in zip(split(key, len(moves)), moves, strict=True) if moves else ():
         mixture = move(move_key, mixture, now)  # pyright: ignore[reportArgumentType]
-    return mixture.replace(in_order=False)
+    return mixture.with_order(False)
 
 
 def name_of(move: AbstractMove) -> str:
@@ -189,7 +196,7 @@ def memory_of(
 
 def is_missing(now: Step | None) -> bool:
     """Whether a move is part of a step without an observation, as x_0 is not."""
-    return now is not None and now.observation is None and not now.is_initial
+    return now is not None and not now.is_present and not now.is_initial
 
 
 Regrouped = tuple[Int[Array, " n"], dict[str, PyTree]]
@@ -256,7 +263,7 @@ def unless_waiting(resampled: ParticleMixture, mixture: ParticleMixture) -> Part
     return jax.tree.map(
         lambda new, old: new if new is old else jnp.where(waits, old, new),
         resampled,
-        mixture.replace(in_order=resampled.in_order),
+        mixture.with_order(resampled.in_order),
     )
 
 
@@ -282,8 +289,7 @@ class AbstractPropagation(AbstractMove):
     weighs = True
     keeps_mass = False
 
-    # What is resampled within is not the mixture that the step was given, nor its trajectories.
-    would_resample = AbstractMove.would_resample
+    # What is resampled within has no trajectories.
     around = AbstractMove.around
 
 
@@ -324,13 +330,6 @@ class AbstractWrapper(AbstractMove):
         for move in self.inner:
             move.check(now, num_particles, num_components)
 
-    def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
-        """Which components of `mixture` any of the moves would resample."""
-        due = jnp.zeros(mixture.num_components, bool)
-        for move in self.inner:
-            due |= move.would_resample(mixture, now)
-        return due
-
     def initial_memory(
         self, model: AbstractStateSpaceModel, num_components: int
     ) -> dict[str, PyTree]:
@@ -341,11 +340,34 @@ class AbstractWrapper(AbstractMove):
         """The same with the moves around the trajectory."""
         return self.map_inner(lambda move: move.around(reference))
 
-    def evidence_against(
-        self, mixture: ParticleMixture, now: Step, increment: Float[Array, ""]
-    ) -> Float[Array, ""] | None:
-        """That of the first of the moves that has it."""
-        for move in self.inner:
-            if (told := move.evidence_against(mixture, now, increment)) is not None:
-                return told
-        return None
+
+class AbstractProposal(Given):
+    """A way to draw x_t given x_{t-1} and y_t, with the density of each draw."""
+
+    def check(self, now: Step) -> None:
+        """Raise a `ValueError` for a model that the proposal is not for; most are for any."""
+
+    @abc.abstractmethod
+    def propose(
+        self, key: Key[Array, ""], now: Step, previous_states: PyTree
+    ) -> tuple[PyTree, Float[Array, " n"]]:
+        """x_t ~ q(. | x_{t-1}, y_t) for every particle, and log q of each, shape (n,).
+
+        `now` has the model, y_t and u_t. A proposal may also have
+        `log_density(now, states, previous_states)`, log q of
+        states that were not drawn from it, (n,). `mpfjax.smoothing.conditional_filter` needs it.
+        And it may make its draws of standard normal noise, (n, k), which `Propagate(noise="rqmc")`
+        needs: `propose_from_noise(noise, now, previous_states)` returns what `propose`
+        does, and `noise_dimension(previous_states)` is k.
+        """
+
+
+def propagation_of(moves: Moves) -> AbstractPropagationOfEach | None:
+    """The first move that propagates particles each on its own, also within a wrapper."""
+    for move in moves:
+        if isinstance(move, AbstractPropagationOfEach):
+            return move
+        held = None if isinstance(move, AbstractPropagation) else propagation_of(move.inner)
+        if held is not None:
+            return held
+    return None

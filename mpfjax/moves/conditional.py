@@ -14,13 +14,31 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Key, PyTree
 
+from mpfjax.memory import Memory, Offspring
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractPropagation, Step, is_missing
 from mpfjax.operations.rows import select_rows
 from mpfjax.operations.stored import take
 
-REFERENCE = "reference"  # the name of its slot and time in a mixture's memory
+REFERENCE = "reference"  # the name of its slot in a mixture's memory
+
+
+class ReferenceSlot(Memory):
+    """The slot of x*_t."""
+
+    slot: Int[Array, ""]
+
+    def kept_slot(self) -> Int[Array, ""]:
+        """The slot of x*_t, which always has an offspring."""
+        return self.slot
+
+    def after_resampling(
+        self, before: ParticleMixture, after: ParticleMixture, offspring: Offspring
+    ) -> "ReferenceSlot":
+        """The slot of its offspring."""
+        assert offspring.kept is not None
+        return ReferenceSlot(offspring.kept)
 
 
 class Reference(NamedTuple):
@@ -30,6 +48,10 @@ class Reference(NamedTuple):
     """x*_0, ..., x*_t, leaves (t + 1, ...)."""
     first_slot: Int[Array, ""]
     """the slot of x*_0."""
+
+    def propagation(self, move: Any) -> "ConditionalPropagation":
+        """A `Propagate` or `Predict` around the trajectory."""
+        return ConditionalPropagation(move, self)
 
 
 class ConditionalPropagation(AbstractPropagation):
@@ -49,9 +71,8 @@ class ConditionalPropagation(AbstractPropagation):
             require(self.move.proposal, "log_density", "conditional SMC", "proposal")
 
     def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
-        """The reference slot, and the time of the particles."""
-        time = jnp.zeros((), jnp.int32)
-        return {REFERENCE: {"slot": self.reference.first_slot, "time": time}}
+        """The reference slot."""
+        return {REFERENCE: ReferenceSlot(self.reference.first_slot)}
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate around x*_t, and weigh as the move does."""
@@ -62,7 +83,7 @@ class ConditionalPropagation(AbstractPropagation):
             return moved if is_missing(now) else self.move.weighed(moved, now)
         states, log_density = proposal.propose(key, now, previous)
         moved = self._with_reference(mixture.replace(particles=states))
-        slot = mixture.memory[REFERENCE]["slot"]
+        slot = mixture.memory[REFERENCE].slot
 
         def of_slot(tree: PyTree) -> PyTree:
             return jax.tree.map(lambda leaf: take(leaf, slot[None]), tree)
@@ -72,12 +93,11 @@ class ConditionalPropagation(AbstractPropagation):
         return self.move.weighed(moved, now, previous, log_density)
 
     def _with_reference(self, mixture: ParticleMixture) -> ParticleMixture:
-        """The particles at the next time, with x* of that time in its slot."""
-        slot, time = (mixture.memory[REFERENCE][name] for name in ("slot", "time"))
-        states = jax.tree.map(lambda leaf: at(leaf, time + 1), self.reference.trajectory)
+        """The particles of x_t, with x*_t in its slot."""
+        slot = mixture.memory[REFERENCE].slot
+        states = jax.tree.map(lambda leaf: at(leaf, mixture.t), self.reference.trajectory)
         particles = jax.tree.map(lambda leaf, own: put(leaf, own, slot), mixture.particles, states)
-        memory = mixture.memory | {REFERENCE: {"slot": slot, "time": time + 1}}
-        return mixture.replace(particles=particles, memory=memory)
+        return mixture.replace(particles=particles)
 
 
 def at(values: Array, place: Int[Array, ""]) -> Array:

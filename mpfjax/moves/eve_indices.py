@@ -5,19 +5,20 @@ updates it, wherever it is in a chain or within a move.
 `mpfjax.smoothing.variance.log_marginal_likelihood_variance` has the equations.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
+from mpfjax.memory import Memory, Offspring
 from mpfjax.mixture import ParticleMixture
+from mpfjax.operations.islands import num_islands
 from mpfjax.operations.segments import segment_sum
 from mpfjax.operations.stored import take
 
 EVE_INDICES = "eve_indices"
 
 
-class EveIndices(eqx.Module):
+class EveIndices(Memory):
     """The memory from which the errors of log Ẑ and of the masses are estimated, O(N + M²) numbers.
 
     - `indices`: (n,), the slot in x_0 that each particle descends from.
@@ -40,38 +41,45 @@ class EveIndices(eqx.Module):
         families = labels * n + self.indices
         return segment_sum(weights, families, num_labels * n).reshape(num_labels, n)
 
+    @classmethod
+    def of(cls, mixture: ParticleMixture) -> "EveIndices":
+        """Those of x_0, every particle its own Eve."""
+        n, m = mixture.num_particles, mixture.num_components
+        return cls(
+            indices=jnp.arange(n, dtype=jnp.int32),
+            groups=jnp.zeros(n, jnp.int32),
+            log_pair_factors=jnp.zeros((m, m), mixture.log_weights.dtype),
+        )
 
-def with_new_eve_indices(mixture: ParticleMixture) -> ParticleMixture:
-    """The mixture of x_0, every particle its own Eve."""
-    n, m = mixture.num_particles, mixture.num_components
-    eve = EveIndices(
-        indices=jnp.arange(n, dtype=jnp.int32),
-        groups=jnp.zeros(n, jnp.int32),
-        log_pair_factors=jnp.zeros((m, m), mixture.log_weights.dtype),
-    )
-    return mixture.replace(memory=mixture.memory | {EVE_INDICES: eve})
+    def at_start(self, mixture: ParticleMixture) -> "EveIndices":
+        """Every particle its own Eve."""
+        return EveIndices.of(mixture)
 
+    def after_resampling(
+        self, before: ParticleMixture, after: ParticleMixture, offspring: Offspring
+    ) -> "EveIndices":
+        """The Eve indices of the offspring."""
+        parents, num_drawn, due, _ = offspring
+        log_factors, groups = self.log_pair_factors, self.groups
+        if before.num_components > 1:
+            # Where nothing is drawn, the groups stay as they are, and nothing is averaged.
+            any_due = jnp.any(due)
+            log_factors = jnp.where(any_due, _by_components(self, before), log_factors)
+            groups = jnp.where(any_due, after.component_indicators, take(groups, parents))
+        k = num_drawn.astype(log_factors.dtype)
+        # A component of one particle has no pair.
+        grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)
+        return EveIndices(take(self.indices, parents), groups, log_factors + jnp.diag(grown))
 
-def with_offspring(
-    resampled: ParticleMixture,
-    before: ParticleMixture,
-    parents: Int[Array, " n"],
-    num_drawn: Int[Array, " m"],
-    due: Bool[Array, " m"],
-) -> ParticleMixture:
-    """The resampled mixture with the Eve indices of its particles."""
-    eve: EveIndices = before.memory[EVE_INDICES]
-    log_factors, groups = eve.log_pair_factors, eve.groups
-    if before.num_components > 1:
-        # Where nothing is drawn, the groups stay as they are, and nothing is averaged.
-        any_due = jnp.any(due)
-        log_factors = jnp.where(any_due, _by_components(eve, before), log_factors)
-        groups = jnp.where(any_due, resampled.component_indicators, take(groups, parents))
-    k = num_drawn.astype(log_factors.dtype)
-    # A component of one particle has no pair.
-    grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)
-    eve = EveIndices(take(eve.indices, parents), groups, log_factors + jnp.diag(grown))
-    return resampled.replace(memory=resampled.memory | {EVE_INDICES: eve})
+    def after_step(self, mixture: ParticleMixture, now, increment):
+        """The errors of log Ẑ and of the masses; none on islands, which families may span."""
+        if num_islands() > 1:
+            return self, {}
+        variance = jnp.where(increment == -jnp.inf, jnp.inf, evidence_variance(mixture))
+        return self, {
+            "log_marginal_likelihood_error": jnp.sqrt(jnp.maximum(variance, 0.0)),
+            "mixture_weight_errors": jnp.sqrt(jnp.maximum(mass_variances(mixture), 0.0)),
+        }
 
 
 def evidence_variance(mixture: ParticleMixture) -> Float[Array, ""]:

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
@@ -57,11 +57,6 @@ class Every(AbstractWrapper):
         own = {self.name: {"steps": jnp.zeros((), jnp.int32)}}
         return own | super().initial_memory(model, num_components)
 
-    def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
-        """Which components of `mixture` the moves would resample now."""
-        runs = mixture.memory[self.name]["steps"] == self.every - 1
-        return super().would_resample(mixture, now) & runs
-
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:
@@ -71,7 +66,7 @@ class Every(AbstractWrapper):
         steps = mixture.memory[self.name]["steps"] + 1
         counted = mixture.memory | {self.name: {"steps": steps % self.every}}
         # As after the moves, which run at every k-th step alone: both have one form.
-        mixture = mixture.replace(memory=counted, in_order=False)
+        mixture = mixture.replace(memory=counted).with_order(False)
         runs = steps == self.every
 
         def run() -> ParticleMixture:

@@ -1,7 +1,5 @@
 """x_0: its draws, and the choice among many draws by the first observation."""
 
-from typing import Any, cast
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,13 +8,8 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import (
-    AbstractStateSpaceModel,
-    check_states,
-    is_made_of_noise,
-)
-from mpfjax.models.conditionally_linear import with_moments
-from mpfjax.models.noise import Noise, draw_noise
+from mpfjax.models.law import law_of
+from mpfjax.models.noise import Noise
 from mpfjax.moves.base import AbstractMove, Step
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import HILBERT, Line, sorted_order
@@ -37,21 +30,9 @@ MOST_AT_ONCE = 8
 FEWEST, LEAST_PART = 16, 1 / 64
 
 
-def sample_initial(
-    key: Key[Array, ""],
-    model: AbstractStateSpaceModel,
-    num_particles: int,
-    noise: str = "independent",
-) -> PyTree:
-    """The particles of x_0, of this noise if the model can; raises for leaves of another length."""
-    if noise == "independent" or not is_made_of_noise(model, "initial"):
-        particles = model.sample_initial(key, num_particles)
-    else:
-        maker = cast(Any, model)
-        shape = (num_particles, maker.initial_noise_dimension)
-        particles = maker.initial_from_noise(draw_noise(key, noise, shape, default_float()))
-    check_states(particles, model, "sample_initial", num_particles)
-    return with_moments(model, particles)
+def sample_initial(key, model, num_particles, noise="independent"):
+    """The particles of x_0, of this noise if the model can."""
+    return law_of(model).sample_initial(key, num_particles, noise)
 
 
 class SelectInitial(AbstractMove):

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import Count, Exponent, InnerShare
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
-from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.models.steps import likelihoods, log_transition
+from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.moves.base import AbstractMarkovMove, Gradient, Step, is_missing
 from mpfjax.moves.propagation.tempered import accepted
 from mpfjax.operations.logarithms import add_gradient, without_gradient
@@ -33,8 +32,8 @@ class _Target(NamedTuple):
 
     def __call__(self, states: PyTree) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """log D and log L, separately: with a large constant in L, their sum loses digits of D."""
-        log_likelihood = likelihoods(self.model, self.observation, states)
-        return log_transition(self.model, states, self.parents), log_likelihood
+        log_likelihood = law_of(self.model).log_likelihood(self.observation, states)
+        return law_of(self.model).log_transition(states, self.parents), log_likelihood
 
     def ratio(self, new: tuple[Array, Array], old: tuple[Array, Array]) -> Float[Array, " n"]:
         """log π(x') - log π(x)."""

@@ -135,6 +135,7 @@ def _whole_mixture(islands: ParticleMixture) -> ParticleMixture:
         ancestor_indices=side_by_side(islands.ancestor_indices),
         num_components=num_islands * num_components,
         memory=islands.memory,
+        t=islands.t[0],
         periods=jax.tree.map(lambda leaf: leaf[0], islands.periods),
     )
 

@@ -9,9 +9,9 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
+from mpfjax.memory import at_start
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import as_series, gathered
-from mpfjax.moves.eve_indices import EVE_INDICES, with_new_eve_indices
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import num_processors, over_devices, over_threads
 from mpfjax.running.scan import FilterRun, first_mixture, initial_keys, scan, sound, told_of_start
@@ -116,9 +116,7 @@ def _start_each(keys, filter, series, slots):
         number = jnp.asarray(filter.num_particles, jnp.int32)
         slot = jnp.arange(slots, dtype=jnp.int32)
         # Those that stay empty hold one of the particles as well.
-        filled = mixture.at(jnp.minimum(slot, number - 1))
-        if EVE_INDICES in mixture.memory:
-            filled = with_new_eve_indices(filled)
+        filled = at_start(mixture.at(jnp.minimum(slot, number - 1)))
         return filled.replace(
             log_weights=jnp.where(slot < number, filled.log_weights, -jnp.inf),
             ancestor_indices=slot,

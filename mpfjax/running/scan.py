@@ -104,18 +104,19 @@ def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> P
     """
     log_islands = math.log(num_islands())
     first = jax.tree.map(lambda leaf: leaf[0], series)
-    given = filter.with_inputs(first.inputs)
     if not filter.weighs_initially:
         # Where it is missing, it tells the form of those that follow.
-        mixture = given._init(key, first.observations)
+        mixture = filter._init(key, first.observations, first.inputs)
         return mixture.replace(log_weights=mixture.log_weights - log_islands)
     if first.present is None:
-        mixture = given._init(key, first.observations)
+        mixture = filter._init(key, first.observations, first.inputs)
     else:
-        chosen = partial(given._init, key, first.observations)
+        chosen = partial(filter._init, key, first.observations, first.inputs)
         # Room for observations is there in any case.
         mixture = jax.lax.cond(
-            first.present, chosen, lambda: given._init(key).replace(memory=chosen().memory)
+            first.present,
+            chosen,
+            lambda: filter._init(key, inputs=first.inputs).replace(memory=chosen().memory),
         )
     return mixture.replace(log_scale=mixture.log_scale - log_islands)
 
@@ -160,13 +161,12 @@ def step_or_predict(
     now: Series,
 ) -> tuple[ParticleMixture, StepInfo]:
     """A step of the filter, or a prediction where the observation is missing; `now` is of one t."""
-    filter = filter.with_inputs(now.inputs)
     if now.present is None:
-        return filter._step(key, mixture, now.observations)
+        return filter._step(key, mixture, now.observations, now.inputs)
     return jax.lax.cond(
         now.present,
-        lambda: filter._step(key, mixture, now.observations),
-        lambda: filter._step(key, mixture),
+        lambda: filter._step(key, mixture, now.observations, now.inputs),
+        lambda: filter._step(key, mixture, inputs=now.inputs),
     )
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import with_inputs
-from mpfjax.models.steps import log_transition
+from mpfjax.models.law import law_of
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.prefix_sums import needs_units, sum_before, to_units, unit_bits
@@ -69,7 +69,7 @@ def log_kernel_from(model: Any, mixture: ParticleMixture) -> Callable[[PyTree], 
 
     def log_density(state: PyTree) -> Float[Array, " n"]:
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), state)
-        return log_transition(model, copies, mixture.particles)
+        return law_of(model).log_transition(copies, mixture.particles)
 
     return log_density
 
@@ -131,7 +131,7 @@ def walk(
 
     def log_density(indices: Int[Array, " k"]) -> Float[Array, " k"]:
         previous = jax.tree.map(lambda leaf: take(leaf, indices), mixture.particles)
-        return log_transition(model, next_states, previous)
+        return law_of(model).log_transition(next_states, previous)
 
     def move(
         place: tuple[Int[Array, " k"], Float[Array, " k"]],

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 from mpfjax.checks import checked, kinds
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, require
-from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.observations import Series, as_arrays, as_series, refused_where
 from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
 from mpfjax.moves.initial import sample_initial
@@ -125,7 +125,7 @@ def renew(
     )
     initial = around._init(initial_keys(key_run, around), particles=start)
     run = scan(key_run, around, series, None, initial=initial)
-    slots = run.collected.memory[REFERENCE]["slot"]
+    slots = run.collected.memory[REFERENCE].slot
     log_weights = jax.vmap(at)(run.collected.log_weights, slots)
     seen = (log_weights > -jnp.inf) & ~run.degenerate
     drawn = draw_trajectory(key_back, filter.model, run, series.inputs, backward, checked)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.checks import Count, check_one_each, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import with_inputs
 from mpfjax.models.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_with_floats_traced
 
@@ -66,9 +67,9 @@ def _forecast(key, filter, mixture, inputs, num_steps):
     ) -> tuple[ParticleMixture, Any]:
         key, now = step
         key_step, key_observation = jax.random.split(key)
-        at_step = filter.with_inputs(now)
-        mixture, _ = at_step._step(key_step, mixture)
-        simulate, observations = getattr(at_step.model, "sample_observation", None), None
+        mixture, _ = filter._step(key_step, mixture, inputs=now)
+        model, observations = with_inputs(filter.model, now), None
+        simulate = getattr(model, "sample_observation", None)
         if callable(simulate):
             observations = simulate(key_observation, mixture.particles)
             check_one_each(mixture.num_particles, sample_observation=observations)

@@ -34,7 +34,7 @@ from mpfjax.models.gaussians import (
     transposed,
     without_missing,
 )
-from mpfjax.models.steps import log_transition
+from mpfjax.models.law import law_of
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
@@ -197,7 +197,7 @@ def _indices(
         own, *of_future = trajectory
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), own)
         law = linear.predicted_gaussian(model, copies, state)
-        log_density = log_transition(model, copies, state)
+        log_density = law_of(model).log_transition(copies, state)
         seen = linear.emission_of(model, copies, state)
         if seen is not None:
             rows = linear.observation_rows(model, observation, seen, state.mean.dtype)

@@ -14,7 +14,7 @@ from mpfjax.checks import Checked, Count, CountOrZero, check_one_each, checked, 
 from mpfjax.filter import Filter, check_keep_parents
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require, with_inputs
-from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.observations import as_series, one_input, one_observation
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.logarithms import as_inexact

@@ -14,9 +14,9 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, Step, all_of
 from mpfjax.moves.eve_indices import (
     EVE_INDICES,
+    EveIndices,
     evidence_variance,
     mass_variances,
-    with_new_eve_indices,
 )
 from mpfjax.operations.logarithms import log_sum_exp
 from mpfjax.running.scan import FilterRun
@@ -38,7 +38,7 @@ class _KeepEveIndices(AbstractMove):
     ) -> ParticleMixture:
         """The mixture with a memory in which every particle is its own Eve."""
         del key, now
-        return with_new_eve_indices(mixture)
+        return mixture.replace(memory=mixture.memory | {EVE_INDICES: EveIndices.of(mixture)})
 
 
 @checked

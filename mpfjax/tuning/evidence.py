@@ -11,8 +11,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import Rule, kinds, warn
 from mpfjax.filter import Filter
 from mpfjax.models.observations import Series, as_series, gathered
-from mpfjax.moves.base import all_of
-from mpfjax.moves.propagation.proposals import AbstractProposal
+from mpfjax.moves.base import AbstractProposal, all_of
 from mpfjax.running.scan import FilterRun, scan
 from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, placed, pose
 

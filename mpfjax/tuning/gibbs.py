@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from mpfjax.checks import Count, checked, saying
 from mpfjax.filter import Filter
 from mpfjax.models.base import require, with_inputs
+from mpfjax.models.law import law_of
 from mpfjax.models.observations import Series
-from mpfjax.models.steps import likelihoods
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.conditional import (
@@ -155,7 +155,7 @@ class LogJoint(eqx.Module):
 
         def log_likelihood(observation: PyTree, inputs: PyTree, state: PyTree) -> Float[Array, ""]:
             one = jax.tree.map(lambda leaf: leaf[None], state)
-            return likelihoods(with_inputs(model, inputs), observation, one)[0]
+            return law_of(with_inputs(model, inputs)).log_likelihood(observation, one)[0]
 
         seen = jax.vmap(log_likelihood)(self.series.observations, self.series.inputs, after)
         if self.series.present is not None:

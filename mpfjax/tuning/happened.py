@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import Count, checked
 from mpfjax.filter import check_keep_parents
 from mpfjax.models.base import with_inputs
-from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.observations import Series
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.smoothing.backward import draw

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, checked
 from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.models.steps import likelihoods, moved
+from mpfjax.models.law import law_of
 
 
 class LabelLikelihood(eqx.Module):
@@ -57,7 +57,7 @@ class LabelLikelihood(eqx.Module):
             states = jax.tree.map(lambda *both: jnp.concatenate(both, axis=1), own, rivals)
             k, n = jax.tree.leaves(states)[0].shape[:2]
             flat = jax.tree.map(lambda leaf: leaf.reshape(k * n, *leaf.shape[2:]), states)
-            logs = likelihoods(model, observation, flat).reshape(k, n)
+            logs = law_of(model).log_likelihood(observation, flat).reshape(k, n)
             return logs[:, 0] - logsumexp(logs, axis=1) + jnp.log(jnp.asarray(n, logs.dtype))
 
         return jax.lax.map(of_frame, (self.observations, self.labels, self.candidates))
@@ -78,5 +78,5 @@ def transition_candidates(
         lambda leaf: jnp.repeat(leaf[:-1].reshape((t - 1) * k, *leaf.shape[2:]), lead[2], axis=0),
         labels,
     )
-    drawn = moved(key, model, before)
+    drawn = law_of(model).move(key, before)
     return jax.tree.map(lambda leaf: leaf.reshape(*lead, *leaf.shape[1:]), drawn)

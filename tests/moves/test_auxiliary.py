@@ -72,7 +72,7 @@ def test_what_is_expected_stays_the_same_in_every_component():
     one = jax.jit(jax.vmap(lambda key: sums(move(key, MIXTURE, now))))
     moved = np.asarray(one(jax.random.split(KEY, 4000)))
     assert_unbiased(moved, sums(MIXTURE), errors=4.5, slack=1e-5)
-    due = np.asarray(move.would_resample(MIXTURE, now))
+    due = np.asarray(move(jax.random.key(0), MIXTURE.at_step(), now).within.resampled)
     assert due.any()
     assert not due.all()
     assert (moved.std(0)[:, 0] > 1e-3)[due].all()  # the mass does vary

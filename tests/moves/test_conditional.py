@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mpfjax import ParticleMixture, Resample
-from mpfjax.moves.conditional import REFERENCE
+from mpfjax.moves.conditional import REFERENCE, ReferenceSlot
 from mpfjax.moves.resampling.ancestors import SCHEMES
 from tests.marking import quick_of
 from tests.unbiased import assert_unbiased
@@ -47,7 +47,7 @@ def drawn(case):
             ancestor_indices=jnp.arange(8, dtype=jnp.int32),
             num_components=m,
         )
-        memory = {REFERENCE: {"slot": slot, "time": jnp.zeros((), jnp.int32)}}
+        memory = {REFERENCE: ReferenceSlot(slot)}
         around = move(key_around, mixture.replace(memory=memory))
         return slot, move(key_plain, mixture), around
 
@@ -97,7 +97,7 @@ def test_of_one_reference_it_is_the_ordinary_law_weighed_by_its_offspring(case):
 @over_cases
 def test_the_reference_has_an_offspring_in_any_slot_of_its_component(case):
     slots, plain, around = drawn(case)
-    new, rows = around.memory[REFERENCE]["slot"], np.arange(NUM_RUNS)
+    new, rows = around.memory[REFERENCE].slot, np.arange(NUM_RUNS)
     labels = LABELS[CASES[case][1]]
     np.testing.assert_array_equal(around.ancestor_indices[rows, new], slots)
     np.testing.assert_array_equal(around.component_indicators[rows, new], labels[slots])

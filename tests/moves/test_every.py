@@ -80,12 +80,6 @@ class Odd(mpfjax.AbstractRegrouping):
     def check(self, now, num_particles, num_components):
         raise ValueError(f"odd: {num_components}")
 
-    def would_resample(self, mixture, now):
-        return jnp.ones(mixture.num_components, bool)
-
-    def evidence_against(self, mixture, now, increment):
-        return increment + 1
-
 
 def test_a_move_that_holds_moves_forwards_all_that_they_are():
     move = Every(1, [KMeans(), Odd()])
@@ -99,8 +93,6 @@ def test_a_move_that_holds_moves_forwards_all_that_they_are():
     )  # fmt: skip
     assert "odd" in mixture.memory
     now = mpfjax.Step(MODEL, jnp.float32(1.0))
-    assert move.would_resample(mixture, now).all()
-    assert move.evidence_against(mixture, now, jnp.float32(1.0)) == 2
     with pytest.raises(ValueError, match="odd"):
         move.check(now, 4, 3)
 
@@ -118,7 +110,7 @@ def test_a_resampling_from_time_to_time_leaves_the_choice_of_x_0_alone():
 
 def test_particles_in_order_come_through():
     """Both branches have one form, whatever moved the particles before."""
-    mixture = single_component(jnp.arange(6.0), 2).replace(in_order=True)
+    mixture = single_component(jnp.arange(6.0), 2).at_step().with_order(True)
     filter = mpfjax.Filter(MODEL, [Propagate(), Every(2, [RandomLabels()])], 6, 2)
     memory = filter.moves[1].initial_memory(MODEL, 2)
     moved = filter.moves[1](KEYS[0], mixture.replace(memory=memory), None)

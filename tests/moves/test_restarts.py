@@ -11,7 +11,7 @@ import pytest
 import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.mixture import single_component
-from mpfjax.moves.alarm import is_alarmed
+from mpfjax.moves.alarm import SURPRISE
 from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_sums
 from tests.marking import weekly
 from tests.moves.start.test_start import KEY, SEEN, mean
@@ -225,7 +225,7 @@ def test_an_alarm_is_given_where_all_hypotheses_are_wrong(name, told):
 def test_after_a_restart_the_state_is_found_and_the_alarm_ends(told):
     run, _ = told["restarts", True]
     np.testing.assert_allclose(jax.vmap(lambda m: m.mean())(run.final), 11.0, atol=0.5)
-    assert not np.asarray(jax.vmap(is_alarmed)(run.final)).any()
+    assert not np.asarray(run.final.memory[SURPRISE].rings).any()
 
 
 def test_the_evidence_is_that_of_the_prior_beside_the_increment(told):

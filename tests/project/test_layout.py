@@ -8,7 +8,7 @@ from tests.bugs import BUGS
 PACKAGE = Path(__file__).resolve().parents[2] / "mpfjax"
 # From the ground up: each part may import from those above it here, and from itself.
 ORDER = """
-    checks operations mixture models moves report filter running lookahead
+    checks operations memory mixture models moves report filter running lookahead
     transforms filters smoothing console exact metrics vision tuning plotting command __main__
 """
 # Inside the folders that hold several floors: files, and folders.
@@ -17,8 +17,8 @@ FLOORS = {
         logarithms islands rows stored matrices compiling random prefix_sums segments
     """,
     "moves": """
-        base alarm eve_indices conditional every regrouping resampling propagation metropolis
-        objects initial start
+        base eve_indices conditional every regrouping resampling propagation metropolis
+        objects initial alarm start
     """,
     "vision": "files colour tracking boxes",
     "lookahead": "quadratics pilot twisted regression learned",

@@ -59,7 +59,8 @@ def test_many_metropolis_steps_leave_the_target_as_it_is(move):
     mean = variance * (0.9 * parents / 0.36 + y / 0.15**2)
     states = mean + np.sqrt(variance) * rng.normal(size=n)
     mixture = make_mixture(states, np.zeros(n), np.zeros(n), 1)
-    mixture = mixture.replace(parents=jnp.asarray(parents, jnp.float32))
+    before = mixture.replace(particles=jnp.asarray(parents, jnp.float32)).at_step()
+    mixture = before.with_parents().replace(particles=mixture.particles)
     start, two_steps = mixture.particles, eqx.filter_jit(move(2, least_step=0.5))
     for key in jax.random.split(jax.random.key(1), 6):
         mixture = two_steps(key, mixture, mpfjax.Step(model, jnp.array(y)))

@@ -109,7 +109,8 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
         if self.reassembly == "prior" and mixture.num_components > 1:
             moved = _with_masses_of(mixture, moved)
         # Resampling may have lost a NaN, or left nothing of the particles but empty slots.
-        moved = moved.replace(log_weights=jnp.where(broken, jnp.nan, moved.log_weights))
+        log_weights = jnp.where(broken, jnp.nan, moved.log_weights)
+        moved = moved.replace(log_weights=log_weights).with_resampled_of(mixture)
         lost = ~broken & ~jnp.any(moved.log_weights > -jnp.inf)
 
         def predicted() -> ParticleMixture:

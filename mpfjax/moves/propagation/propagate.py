@@ -6,44 +6,23 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Exponent, check
+from mpfjax.checks import Exponent
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import (
-    AbstractStateSpaceModel,
-    check_moved,
-    is_made_of_noise,
-    require,
-    require_noise,
-)
-from mpfjax.models.conditionally_linear import (
-    AbstractConditionallyLinearModel,
-    is_mixed,
-    refuse_marginalised,
-)
+from mpfjax.models.base import AbstractStateSpaceModel, check_moved, require, require_noise
+from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.models.noise import Noise, draw_noise, noise_dtype
-from mpfjax.models.steps import (
-    completed,
-    drawn,
-    drawn_part,
-    likelihoods,
-    log_transition,
-    made_of,
-    noise_dimension,
-    seen,
-)
 from mpfjax.moves.base import (
     AbstractPropagation,
     AbstractPropagationOfEach,
+    AbstractProposal,
     Gradient,
     Step,
     is_missing,
 )
-from mpfjax.moves.conditional import ConditionalPropagation, Reference
-from mpfjax.moves.propagation.proposals import AbstractProposal
 from mpfjax.operations.logarithms import add_gradient, finite_max, without_gradient
 
 
-class _Propagation(AbstractPropagation):
+class Draw(AbstractPropagation):
     """x_t drawn by the model's own law or a proposal, and what it weighs."""
 
     proposal: AbstractProposal | None = None
@@ -55,32 +34,31 @@ class _Propagation(AbstractPropagation):
         model, proposal, needs_noise = now.model, self.proposal, self.noise != "independent"
         if proposal is not None:
             proposal.check(now)
-        # The mixed form has the law of z_t and its noise whatever the model's methods are.
-        has_law = is_mixed(model)
-        if not has_law and (self.gradient == "stop" or proposal is not None):
+        has_density = law_of(model).has_density
+        if not has_density and (self.gradient == "stop" or proposal is not None):
             require(model, "log_transition", "gradient='stop' or a proposal")
         if needs_noise and proposal is not None:
             require(proposal, "propose_from_noise", f"noise={self.noise!r}", "proposal")
-        elif needs_noise and not has_law:
+        elif needs_noise and not has_density:
             require_noise(model, f"noise={self.noise!r}")
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t; without it, by the model's own law."""
-        proposal, previous = self.proposal, mixture.particles
+        proposal, previous, law = self.proposal, mixture.particles, now.law
         if proposal is None or is_missing(now):
-            moved = predict(key, now.model, mixture, self.gradient, self.noise)
-            return moved if is_missing(now) else self.weighed(moved, now)
+            mixture = predict(key, now.model, mixture, self.gradient, self.noise)
+            return mixture if is_missing(now) else self.weighed(mixture, now)
         if self.noise == "independent":
             draws, log_density = proposal.propose(key, now, previous)
         else:
             of_noise: Any = proposal
             noise = noise_of_slots(key, self.noise, of_noise.noise_dimension(previous), mixture)
             draws, log_density = of_noise.propose_from_noise(noise, now, previous)
-        check_moved(draws, drawn_part(now.model, previous), proposal, "propose")
+        check_moved(draws, law.part(previous), proposal, "propose")
         if self.gradient == "stop":
             draws, log_density = without_gradient((draws, log_density))
-        moved = mixture.replace(particles=completed(now.model, draws, previous))
-        return self.weighed(moved, now, previous, log_density)
+        mixture = mixture.replace(particles=law.complete(draws, previous))
+        return self.weighed(mixture, now, previous, log_density)
 
     def weighed(
         self,
@@ -90,20 +68,20 @@ class _Propagation(AbstractPropagation):
         log_density: Float[Array, " n"] | None = None,
     ) -> ParticleMixture:
         """The weights of x_t times L, and D / q where each has been drawn with a log q."""
-        states, log_factors = mixture.particles, []
+        law, states, log_factors = now.law, mixture.particles, []
         if self.weighs:
-            states, log_factors = seen(now.model, now.observation, states)
+            states, log_factors = law.see(now.observation, states)
         if log_density is not None:
-            draws = drawn_part(now.model, mixture.particles)
-            log_factors.append(log_transition(now.model, draws, previous) - log_density)
+            draws = law.part(mixture.particles)
+            log_factors.append(law.log_transition(draws, previous) - log_density)
         return mixture.replace(particles=states).weighed(*log_factors)
 
-    def around(self, reference: Reference) -> ConditionalPropagation:
+    def around(self, reference: Any) -> AbstractPropagation:
         """The same around the trajectory, where noise and proposal allow it."""
-        return ConditionalPropagation(self, reference)
+        return reference.propagation(self)
 
 
-class Propagate(_Propagation, AbstractPropagationOfEach):
+class Propagate(Draw, AbstractPropagationOfEach):
     """Draw x_t and multiply the weights by L(y_t | x_t) D(x_t | x_{t-1}) / q(x_t | x_{t-1}, y_t).
 
     This is the weight update of Vermaak et al. (2003), section 3. With joint weights, ordinary
@@ -131,37 +109,7 @@ class Propagate(_Propagation, AbstractPropagationOfEach):
     """
 
 
-class PropagateMarginalised(_Propagation, AbstractPropagationOfEach):
-    """Draw z_t, predict, weigh by the predictive density of y_t, and update by it.
-
-    The step of a Rao-Blackwellised particle filter, or mixture Kalman filter (Chen and Liu 2000;
-    Doucet, de Freitas, Murphy and Russell 2000), for an `AbstractConditionallyLinearModel`. Each
-    particle (z, m, P) draws z_t, and its Kalman filter predicts x_t. The weight is multiplied by
-
-        p(y_t | z_0, ..., z_t, y_1..y_{t-1}) = N(y_t; H m + c, H P Hᵀ + R)
-
-    and by the likelihood of what is seen of z_t alone. Then the Kalman filter is updated. Joint
-    weights then have their mixture weights updated as in `Propagate`, and Ẑ is unbiased. In the
-    mixed form, z_t is drawn from its law given y_1..y_{t-1}, N(f + A m, A P Aᵀ + V), and first
-    updates x_{t-1}. The covariance is updated in Joseph's form, which keeps it positive in float32.
-
-    - `proposal`: z_t ~ q in place of its own law, as `RegimeProposal()`. An `AbstractProposal`
-      whose `propose(key, now, particles)` is given the particles (latent, mean,
-      covariance) of t - 1, and returns z_t and log q. The factor is then p(y_t | ...) p(z_t) / q.
-    - `gradient`, `noise`: those of `Propagate`, of the draw of z_t. Moments are differentiated.
-
-    Without an observation z_t is drawn by its own law, and moments are predicted. Raises
-    `ValueError` for another model, and as `Propagate` does. `particle_filter`,
-    `mixture_particle_filter` and `auxiliary_particle_filter` use it for such a model.
-    """
-
-    def check(self, now: Step, num_particles: int, num_components: int) -> None:
-        """Raise a `ValueError` for another model, and as `Propagate` does."""
-        check(AbstractConditionallyLinearModel, model=now.model)
-        super().check(now, num_particles, num_components)
-
-
-class Predict(_Propagation):
+class Predict(Draw):
     """Draw x_t and multiply the weights by D / q alone: the first half of a `Propagate`.
 
     `Reweight` is the second half. Use the two in a chain that does something in between, such as
@@ -188,7 +136,7 @@ class Reweight(AbstractPropagation):
         if self.exponent != 1:
             refuse_marginalised(now.model, "a part of the likelihood", "take exponent 1")
 
-    def around(self, reference: Reference) -> "Reweight":
+    def around(self, reference: Any) -> "Reweight":
         """The move itself, which weighs the trajectory as any other."""
         return self
 
@@ -197,9 +145,9 @@ class Reweight(AbstractPropagation):
         if is_missing(now):
             return mixture
         if self.exponent == 1:
-            states, log_factors = seen(now.model, now.observation, mixture.particles)
+            states, log_factors = now.law.see(now.observation, mixture.particles)
             return mixture.replace(particles=states).weighed(*log_factors)
-        log_factors = likelihoods(now.model, now.observation, mixture.particles)
+        log_factors = now.law.log_likelihood(now.observation, mixture.particles)
         # Differences would be lost to rounding beside a large common constant.
         common = finite_max(jnp.where(mixture.occupied, log_factors, -jnp.inf))
         return mixture.weighed(self.exponent * (log_factors - common), self.exponent * common[None])
@@ -223,23 +171,14 @@ def predict(
     noise: str = "independent",
 ) -> ParticleMixture:
     """Draws of x_t, with the weights' derivatives times D / ⊥D where the draws have none."""
-    states = mixture.particles
+    law, states, log_weights = law_of(model), mixture.particles, mixture.log_weights
     # The noise may be that of a proposal alone.
-    if noise != "independent" and (is_mixed(model) or is_made_of_noise(model)):
-        numbers = noise_of_slots(key, noise, noise_dimension(model, states), mixture)
-        draws = made_of(model, numbers, states)
+    if noise != "independent" and law.is_of_noise:
+        draws = law.make(noise_of_slots(key, noise, law.noise_dimension(states), mixture), states)
     else:
-        draws = drawn(key, model, states)
-    return _moved(draws, model, mixture, gradient)
-
-
-def _moved(
-    draws: PyTree, model: AbstractStateSpaceModel, mixture: ParticleMixture, gradient: str
-) -> ParticleMixture:
-    """The mixture with these draws, and their density, which "stop" differentiates."""
-    previous, log_weights = mixture.particles, mixture.log_weights
+        draws = law.draw(key, states)
     if gradient == "stop":
         draws = without_gradient(draws)
-        log_density = log_transition(model, draws, previous).astype(log_weights.dtype)
+        log_density = law.log_transition(draws, states).astype(log_weights.dtype)
         log_weights = add_gradient(log_weights, jnp.where(mixture.occupied, log_density, 0.0))
-    return mixture.replace(particles=completed(model, draws, previous), log_weights=log_weights)
+    return mixture.replace(particles=law.complete(draws, states), log_weights=log_weights)

@@ -9,35 +9,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import POSITIVE, Count, Positive, checked, to_array
 from mpfjax.models.base import require
-from mpfjax.models.steps import likelihoods, log_transition
-from mpfjax.moves.base import Given, Step
+from mpfjax.moves.base import AbstractProposal, Step
 from mpfjax.operations.matrices import cholesky, solve_lower
 from mpfjax.operations.random import normal
-
-
-class AbstractProposal(Given):
-    """A way to draw x_t given x_{t-1} and y_t, with the density of each draw."""
-
-    def check(self, now: Step) -> None:
-        """Raise a `ValueError` for a model that the proposal is not for; most are for any."""
-
-    @abc.abstractmethod
-    def propose(
-        self, key: Key[Array, ""], now: Step, previous_states: PyTree
-    ) -> tuple[PyTree, Float[Array, " n"]]:
-        """x_t ~ q(. | x_{t-1}, y_t) for every particle, and log q of each, shape (n,).
-
-        `now` has the model, y_t and u_t. A proposal may also have
-        `log_density(now, states, previous_states)`, log q of
-        states that were not drawn from it, (n,). `mpfjax.smoothing.conditional_filter` needs it.
-        And it may make its draws of standard normal noise, (n, k), which `Propagate(noise="rqmc")`
-        needs: `propose_from_noise(noise, now, previous_states)` returns what `propose`
-        does, and `noise_dimension(previous_states)` is k.
-        """
 
 
 class _Gaussian(NamedTuple):
@@ -192,8 +170,8 @@ class GaussNewtonProposal(_GaussianProposal):
         """
         means, factors = self._fit(now, previous_states)
         states = means.reshape(previous_states.shape)
-        log_densities = likelihoods(now.model, now.observation, states)
-        log_densities += log_transition(now.model, states, previous_states)
+        log_densities = now.law.log_likelihood(now.observation, states)
+        log_densities += now.law.log_transition(states, previous_states)
         return log_densities + 0.5 * means.shape[1] * math.log(2 * math.pi) - _log_diagonal(factors)
 
     def _fit(

@@ -12,12 +12,11 @@ from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel,
+    log_predictive,
     predicted,
     updated,
 )
-from mpfjax.models.steps import log_predictive
-from mpfjax.moves.base import AbstractPropagation, Step, is_missing
-from mpfjax.moves.propagation.proposals import AbstractProposal
+from mpfjax.moves.base import AbstractPropagation, AbstractProposal, Step, is_missing
 from mpfjax.moves.regrouping.partitions import GroupBy
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import Line, in_line
@@ -115,10 +114,6 @@ class PropagateRegimes(AbstractPropagation):
         """Raise a `ValueError` for another model."""
         require_regimes(now.model, "PropagateRegimes")
 
-    def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
-        """All living components."""
-        return mixture.active
-
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate, and weigh by y_t where it is there."""
         model: Any = now.model
@@ -128,6 +123,7 @@ class PropagateRegimes(AbstractPropagation):
             log_priors = jnp.concatenate([log for _, log in pairs])
             family = family.replace(log_weights=family.log_weights + log_priors)
             return self._chosen(key, mixture, family, model)
+        mixture = mixture.with_resampled(mixture.active)
         latents, _, log_factors = children(now, mixture.particles)
         family = self._family(mixture, latents).weighed(log_factors.reshape(-1))
         moved = self._chosen(key, mixture, family, model)

@@ -11,9 +11,8 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import Count, InnerShare, entries, to_numbers
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require_noise
-from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
-from mpfjax.models.steps import likelihoods, made_of
 from mpfjax.moves.base import AbstractPropagation, AbstractWrapper, Step, is_missing
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
@@ -23,8 +22,9 @@ from mpfjax.operations.rows import select_rows
 
 
 class TemperedParticles(NamedTuple):
-    """What is resampled between the stages: x_t, the noise that it is made of, and log L."""
+    """What is resampled between the stages: x_{t-1}, x_t, the noise that made it, and log L."""
 
+    parents: PyTree
     states: PyTree
     noise: Float[Array, "n d"]
     log_likelihoods: Float[Array, " n"]
@@ -90,20 +90,19 @@ class PropagateTempered(AbstractPropagation, AbstractWrapper):
         if is_missing(now):
             return predict(key, model, mixture, "none")
         key_noise, key_stages = split(key, 2)
-        parents = mixture.particles
+        before, parents = mixture, mixture.particles
         noise = normal(
             key_noise, (mixture.num_particles, model.noise_dimension), noise_dtype(parents)
         )
-        states = made_of(model, noise, parents)
-        log_likelihoods = likelihoods(model, now.observation, states)
+        states = now.law.make(noise, parents)
+        log_likelihoods = now.law.log_likelihood(now.observation, states)
         # Resampling may lose a NaN, or a particle whose likelihood is infinite.
         broken = jnp.any(mixture.occupied & ~(log_likelihoods < jnp.inf))
         # Differences between stages would be lost to rounding beside a large common constant.
         common = finite_max(jnp.where(mixture.occupied, log_likelihoods, -jnp.inf))
         log_likelihoods = log_likelihoods - common
-        travellers = TemperedParticles(states, noise, log_likelihoods)
-        mixture = mixture.replace(particles=travellers, parents=parents)
-        mixture = mixture.weighed(self.exponents[0] * log_likelihoods)
+        tempered = TemperedParticles(parents, states, noise, log_likelihoods)
+        mixture = mixture.replace(particles=tempered).weighed(self.exponents[0] * log_likelihoods)
 
         def next_stage(
             mixture: ParticleMixture, stage: tuple[Any, Any, Any]
@@ -121,7 +120,9 @@ class PropagateTempered(AbstractPropagation, AbstractWrapper):
         mixture, _ = jax.lax.scan(next_stage, mixture, stages)
         mixture = mixture.weighed(common[None])
         log_weights = jnp.where(broken, jnp.nan, mixture.log_weights)
-        return mixture.replace(particles=mixture.particles.states, log_weights=log_weights)
+        states = mixture.particles.states
+        mixture = mixture.replace(particles=states, log_weights=log_weights)
+        return mixture.with_resampled_of(before)
 
     def _moved(
         self,
@@ -139,10 +140,10 @@ class PropagateTempered(AbstractPropagation, AbstractWrapper):
         noise = jnp.sqrt(1 - step**2) * here.noise + step * normal(
             key_noise, here.noise.shape, dtype
         )
-        states = made_of(now.model, noise, mixture.parents)
-        log_likelihoods = likelihoods(now.model, now.observation, states) - common
+        states = now.law.make(noise, here.parents)
+        log_likelihoods = now.law.log_likelihood(now.observation, states) - common
         log_ratio = exponent * log_likelihoods - exponent * here.log_likelihoods
-        proposed = TemperedParticles(states, noise, log_likelihoods)
+        proposed = TemperedParticles(here.parents, states, noise, log_likelihoods)
         return mixture.replace(particles=accepted(key_taken, log_ratio, proposed, here))
 
 

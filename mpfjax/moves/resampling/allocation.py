@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.regrouping.features import component_groups
 from mpfjax.operations.logarithms import scaled_exp
 from mpfjax.operations.segments import segments_in_order, spread
 from mpfjax.operations.stored import stored
@@ -100,7 +99,7 @@ def demands_of_groups(
     mixture: ParticleMixture, groups: Int[Array, " n"], due: Bool[Array, " m"]
 ) -> Float[Array, " m"]:
     """For each component, one over the number of components of its group that share slots."""
-    group = component_groups(mixture, groups)
+    group = mixture.component_groups(groups)
     rivals = jnp.sum((group[:, None] == group[None]) & due[None], axis=1)
     return 1 / jnp.maximum(rivals, 1).astype(mixture.log_weights.dtype)
 

@@ -3,7 +3,7 @@
 from typing import Annotated, Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import Rule, saying
 from mpfjax.mixture import ParticleMixture
@@ -60,10 +60,6 @@ class AuxiliaryResample(AbstractWrapper):
         if hasattr(self.lookahead, "check"):
             self.lookahead.check(now)
 
-    def would_resample(self, mixture: ParticleMixture, now: Step) -> Bool[Array, " m"]:
-        """Which components of `mixture` the move would resample."""
-        return self.resample.would_resample(mixture.weighed(self._log_factors(mixture, now)))
-
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Resample every component that is due, looking ahead to y_t, unless that is missing."""
         if is_missing(now):
@@ -71,7 +67,7 @@ class AuxiliaryResample(AbstractWrapper):
         log_factors = self._log_factors(mixture, now)
         # Resampling may lose a NaN, or a particle whose look-ahead is infinite.
         broken = jnp.any(mixture.occupied & ~(log_factors < jnp.inf))
-        due = self.resample.would_resample(mixture.weighed(log_factors))
+        due = self.resample.due(mixture.weighed(log_factors))
         log_factors = jnp.where(spread(due, mixture.component_indicators), log_factors, 0.0)
         drawn, ancestors = self.resample.redraw(key, mixture.weighed(log_factors), due)
         drawn = drawn.weighed(-take(log_factors, ancestors.particles))

@@ -68,7 +68,8 @@ class GaussianRegeneration(AbstractResampling):
         drawn = self._draw(key_noise, self._redrawn(mixture.particles), mixture, vacated)
         if self.where is not None:
             drawn = eqx.tree_at(self.where, vacated.particles, drawn)
-        mixture = vacated.replace(particles=drawn, ancestor_indices=no_ancestors(vacated))
+        redrawn = vacated.replace(particles=drawn, ancestor_indices=no_ancestors(vacated))
+        mixture = redrawn.with_resampled_of(mixture)
         if self.noise != "rqmc":
             return mixture
         # The next noise is a point set over its slots.
@@ -78,7 +79,7 @@ class GaussianRegeneration(AbstractResampling):
         def place(particles: PyTree) -> Array:
             return flatten_states(self._redrawn(particles))
 
-        return mixture.at(sorted_order(mixture, labels, place)).replace(in_order=True)
+        return mixture.at(sorted_order(mixture, labels, place)).with_order(True)
 
     @property
     def _resample(self) -> Resample:

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import Count, Share, one_of
+from mpfjax.memory import Offspring, after_resampling, kept_slot
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractResampling, Gradient, Step
-from mpfjax.moves.conditional import REFERENCE
-from mpfjax.moves.eve_indices import EVE_INDICES, with_offspring
 from mpfjax.moves.resampling.allocation import (
     allocate_slots,
     demands_by_variance,
@@ -108,10 +107,8 @@ class Resample(AbstractResampling):
         """The move itself, which finds the slot of the one that is kept in the memory."""
         return self
 
-    def would_resample(
-        self, mixture: ParticleMixture, now: Step | None = None
-    ) -> Bool[Array, " m"]:
-        """Which components of `mixture` the move would resample."""
+    def due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
+        """Which components are to be resampled."""
         due = mixture.active
         if self.ess_threshold < 1.0:
             counts = mixture.component_counts
@@ -124,7 +121,7 @@ class Resample(AbstractResampling):
 
     def resample(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """The mixture with every component resampled that is due."""
-        return self.redraw(key, mixture, self.would_resample(mixture))[0]
+        return self.redraw(key, mixture, self.due(mixture))[0]
 
     def redraw(
         self, key: Key[Array, ""], mixture: ParticleMixture, due: Bool[Array, " m"]
@@ -138,8 +135,7 @@ class Resample(AbstractResampling):
         n, m = mixture.num_particles, mixture.num_components
         all_are_due = self.ess_threshold == 1.0
         stays = None if all_are_due else ~spread(due, mixture.component_indicators)
-        reference = mixture.memory.get(REFERENCE)
-        keep = None if reference is None else reference["slot"]
+        keep = kept_slot(mixture.memory)
         if keep is not None:
             is_kept = jnp.arange(n, dtype=jnp.int32) == keep
             stays = is_kept if stays is None else stays | is_kept
@@ -162,17 +158,17 @@ class Resample(AbstractResampling):
             log_weights = add_gradient(jax.lax.stop_gradient(log_weights), old)
         if not all_are_due:
             log_weights = jnp.where(spread(due, slots.components), log_weights, old)
-        redrawn = mixture.at(parents).replace(
-            log_weights=jnp.where(slots.filled, log_weights, -jnp.inf),
-            component_indicators=slots.components if m > 1 else mixture.component_indicators,
-            in_order=self.sort_by is not None,
+        redrawn = (
+            mixture.with_resampled(due)
+            .at(parents)
+            .replace(
+                log_weights=jnp.where(slots.filled, log_weights, -jnp.inf),
+                component_indicators=slots.components if m > 1 else mixture.component_indicators,
+            )
+            .with_order(self.sort_by is not None)
         )
-        if reference is not None:
-            kept = {REFERENCE: reference | {"slot": ancestors.kept}}
-            redrawn = redrawn.replace(memory=mixture.memory | kept)
-        if EVE_INDICES in mixture.memory:
-            redrawn = with_offspring(redrawn, mixture, parents, targets, due)
-        return redrawn, ancestors
+        offspring = Offspring(parents, targets, due, ancestors.kept)
+        return after_resampling(mixture, redrawn, offspring), ancestors
 
     def deal(
         self, mixture: ParticleMixture, line: Line, due: Bool[Array, " m"]

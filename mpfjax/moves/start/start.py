@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import Count, InnerShare
 from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
-from mpfjax.moves.alarm import SURPRISE, is_alarmed, over_all_islands
+from mpfjax.moves.alarm import SURPRISE, over_all_islands
 from mpfjax.moves.base import (
     AbstractMove,
     AbstractWrapper,
@@ -125,11 +125,6 @@ class Start(AbstractWrapper):
         who = "filter: a start by observations, as with restarts,"
         raise ValueError(f"{who} cannot keep a trajectory")
 
-    def would_resample(self, mixture: ParticleMixture, now: Step) -> Array:
-        """What the moves would, after the first steps."""
-        due = super().would_resample(mixture, now)
-        return due if START not in mixture.memory else due & ~self._is_first(mixture)
-
     def _is_first(self, mixture: ParticleMixture) -> Array:
         return mixture.memory[START]["taken"] < self.num_observations
 
@@ -145,15 +140,15 @@ class Start(AbstractWrapper):
         if START not in mixture.memory:
             return as_ever()
         # Runs of one `vmap` may be at different steps, and each kind of step runs if any needs it.
-        is_first, same = self._is_first(mixture), mixture.replace(in_order=False)
+        is_first, same = self._is_first(mixture), mixture.with_order(False)
         later = cond_if_any(~is_first, as_ever, lambda: same)
         own = mixture.memory[START]
         age, is_due = own["age"], jnp.zeros((), bool)
         if self.probability is not None:
             # The steps since the sum was zero, of which the oldest may be the first of a new state.
-            age = jnp.where(mixture.memory[SURPRISE] > 0, age + 1, 1)
+            age = jnp.where(mixture.memory[SURPRISE].total > 0, age + 1, 1)
             if not is_missing(now):
-                is_due = is_alarmed(mixture) & (age >= self.num_observations) & ~is_first
+                is_due = mixture.memory[SURPRISE].rings & (age >= self.num_observations) & ~is_first
             age = jnp.where(is_due, 0, age).astype(jnp.int32)
         window = with_step(own["window"], own["taken"], now)
         own = own | {"window": window, "age": age}

@@ -23,8 +23,8 @@ from mpfjax.checks import shown
 from mpfjax.mixture import flatten_states, single_component
 from mpfjax.models.base import innermost, is_made_of_noise, takes_inputs, with_inputs
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed, with_moments
+from mpfjax.models.law import law_of
 from mpfjax.models.noise import noise_dtype, normal_of, uniform_of
-from mpfjax.models.steps import completed, drawn, made_of, noise_dimension, seen
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import in_line
 from mpfjax.operations.logarithms import (
@@ -203,7 +203,7 @@ def _is_of_noise(model: Any) -> bool:
 
 
 def _noise_size(model: Any, states: PyTree) -> int:
-    return noise_dimension(model, states) if _is_of_noise(model) else 2
+    return law_of(model).noise_dimension(states) if _is_of_noise(model) else 2
 
 
 def _noise_of(model: Any, states: PyTree, words: UInt32[Array, "k n"]) -> Array:
@@ -216,16 +216,16 @@ def _advanced(model: Any, window: Window, s: Int[Array, ""], paths: Paths) -> Pa
     now, noise = window.at(s), jax.lax.dynamic_index_in_dim(paths.noise, s, 1, False)
     model = with_inputs(model, now.inputs)
     if _is_of_noise(model):
-        draws = made_of(model, noise, paths.states)
+        draws = law_of(model).make(noise, paths.states)
     else:
 
         def draw(words: UInt32[Array, "2"], state: PyTree) -> PyTree:
             alone = jax.tree.map(lambda leaf: leaf[None], state)
-            moved = drawn(jax.random.wrap_key_data(words), model, alone)
+            moved = law_of(model).draw(jax.random.wrap_key_data(words), alone)
             return jax.tree.map(lambda leaf: leaf[0], moved)
 
         draws = jax.vmap(draw)(noise, paths.states)
-    states, logs = seen(model, now.observations, completed(model, draws, paths.states))
+    states, logs = law_of(model).see(now.observations, law_of(model).complete(draws, paths.states))
     log_last = jnp.where(now.present, sum(logs), 0.0).astype(paths.log_last.dtype)
     log_before = paths.log_before + paths.log_last
     return Paths(paths.places, paths.noise, paths.states, states, log_before, log_last)

@@ -1,0 +1,78 @@
+"""What a mixture remembers from step to step, and how a memory follows the particles.
+
+A mixture's `memory` is a dictionary. An entry may be any pytree, which the move of that name reads
+and replaces itself. An entry that is a `Memory` also follows resampling and steps, so that neither
+the moves nor the filter need to know it.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+
+class Offspring(NamedTuple):
+    """How particles were redrawn: the parent of each slot, and how many each component drew."""
+
+    parents: Int[Array, " n"]
+    num_drawn: Int[Array, " m"]
+    due: Bool[Array, " m"]
+    kept: Int[Array, ""] | None
+    """the slot of the offspring that was to be kept; None where none was."""
+
+
+class Memory(eqx.Module):
+    """An entry of a mixture's memory that follows the particles. By default it does nothing."""
+
+    def kept_slot(self) -> Int[Array, ""] | None:
+        """The slot of a particle that has an offspring whatever is drawn."""
+        return None
+
+    def at_start(self, mixture: Any) -> "Memory":
+        """The memory of particles that have no past."""
+        return self
+
+    def after_resampling(self, before: Any, after: Any, offspring: Offspring) -> "Memory":
+        """The memory after particles were redrawn."""
+        return self
+
+    def after_step(
+        self, mixture: Any, now: Any, increment: Float[Array, ""]
+    ) -> tuple["Memory", dict[str, PyTree]]:
+        """The memory after a step, and what it adds to the report, by field of `StepInfo`."""
+        return self, {}
+
+
+def kept_slot(memory: dict[str, PyTree]) -> Int[Array, ""] | None:
+    """That of the first memory that has one."""
+    for entry in memory.values():
+        if isinstance(entry, Memory) and (slot := entry.kept_slot()) is not None:
+            return slot
+    return None
+
+
+def after_resampling(before: Any, after: Any, offspring: Offspring) -> Any:
+    """The redrawn mixture, whose memories have followed."""
+    for name, entry in before.memory.items():
+        if isinstance(entry, Memory):
+            entry = entry.after_resampling(before, after, offspring)
+            after = after.replace(memory=after.memory | {name: entry})
+    return after
+
+
+def at_start(mixture: Any) -> Any:
+    """The mixture, whose memories are those of particles without a past."""
+    new = {k: v.at_start(mixture) for k, v in mixture.memory.items() if isinstance(v, Memory)}
+    return mixture.replace(memory=mixture.memory | new) if new else mixture
+
+
+def after_step(
+    mixture: Any, now: Any, increment: Float[Array, ""]
+) -> tuple[Any, dict[str, PyTree]]:
+    """The mixture whose memories have heard of the step, and what they add to its report."""
+    report: dict[str, PyTree] = {}
+    for name, entry in mixture.memory.items():
+        if isinstance(entry, Memory):
+            entry, added = entry.after_step(mixture, now, increment)
+            mixture, report = mixture.replace(memory=mixture.memory | {name: entry}), report | added
+    return mixture, report
