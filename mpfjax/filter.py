@@ -221,8 +221,8 @@ class Filter(eqx.Module):
                 moved, log_growth = moved.normalised(mixture)
                 increment += log_growth
             mixture = moved
-        mixture, remembered = after_step(mixture, now, increment)
-        report = report_of(mixture, increment, **remembered)
+        mixture, additions = after_step(mixture, now, increment)
+        report = report_of(mixture, increment, **additions)
         return mixture.replace(within=None, periods=periods_of(now.model)), report
 
 

@@ -47,7 +47,7 @@ class StepInfo(eqx.Module):
 def report_of(
     mixture: ParticleMixture,
     increment: Float[Array, ""],
-    **remembered: Array,
+    **additions: Array,
 ) -> StepInfo:
     """The report of a step that ended in this mixture, with what its memories add."""
     assert mixture.within is not None
@@ -62,5 +62,5 @@ def report_of(
         resampled=mixture.within.resampled,
         degenerate=increment == -jnp.inf,
         labels_ran_out=jnp.all(sizes > 0) & (mixture.num_components > 1),
-        **remembered,
+        **additions,
     )

@@ -18,9 +18,9 @@ from mpfjax.models.law import law_of
 class Series(eqx.Module):
     """All that a filter is given at the steps 1, ..., t; every leaf has a leading axis t.
 
-    Whatever takes observations takes either the arrays of y_1, ..., y_t, all of them finite
-    numbers, or a `Series`, which also says what is known beside them and which are missing. In
-    `run_filter` alone `inputs=` and `missing=` are short for it.
+    Every function of observations accepts either the arrays of y_1, ..., y_t, all of them finite
+    numbers, or a `Series`, which also has the known inputs and says which observations are missing.
+    In `run_filter`, `monte_carlo` and `run_islands`, `inputs=` and `missing=` are short for it.
     """
 
     observations: PyTree

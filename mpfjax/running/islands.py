@@ -6,7 +6,7 @@ Where their masses have become uneven, `IslandInteraction` deals the particles a
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Key, PyTree
 from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.observations import as_series
+from mpfjax.models.observations import as_series, gathered
 from mpfjax.moves.base import AbstractMove, Step, is_missing
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.islands import (
@@ -39,6 +39,8 @@ def run_islands(
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
     num_islands: Count,
+    inputs: PyTree = None,
+    missing: Literal["error", "skip"] = "error",
     devices: int | Sequence[Any] | None = None,
 ) -> FilterRun:
     """Run one filter of G islands, each a copy of `filter`, over many devices.
@@ -50,7 +52,7 @@ def run_islands(
     the mixture weights"; Vergé et al. 2015 for islands). If the filter's marginal likelihood is
     unbiased, so is this one.
 
-    - `observations`: arrays, or a `Series`.
+    - `observations`, `inputs`, `missing`: those of `run_filter`.
     - `filter`: that of one island; N and M are those of one island. A plain particle filter makes
       islands of particles. With an `IslandInteraction` among the moves, their masses stay even.
     - `num_islands`: G. The result depends on the key and on G, not on the devices. With another
@@ -69,7 +71,7 @@ def run_islands(
     divide G. Use it if one filter is too large or too slow for one device. For many runs of a
     filter that fits on one device, use `monte_carlo`.
     """
-    series = as_series(observations, filter.model)
+    series = as_series(gathered(observations, inputs, missing), filter.model)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
 
     def run(filter: Filter) -> FilterRun:

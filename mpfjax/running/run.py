@@ -35,7 +35,7 @@ def run_filter(
     """Run a filter over observations y_1..y_t in one scan.
 
     - `observations`: a pytree whose leaves have a leading axis t; or a `Series`, for which `inputs`
-      and `missing` are short, here alone.
+      and `missing` are short.
     - `collect`: a function of the mixture after each step, or of (mixture, t, u_t) with t from 1
       on; its results are stacked over t. None keeps the whole mixture. The same function object
       compiles once; a new lambda in every call compiles again. Methods of a mixture are for one
@@ -65,13 +65,15 @@ def monte_carlo(
     observations: PyTree,
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
+    inputs: PyTree = None,
+    missing: Literal["error", "skip"] = "error",
     devices: int | Sequence[Any] | None = None,
     slots: Count | None = None,
 ) -> FilterRun:
     """Run a filter once for each key, all on the same observations, under `vmap`.
 
     Every field of the result has a leading axis of seeds. Run k equals `run_filter(keys[k], ...)`,
-    whose errors it raises. With inputs, or where some are missing, `observations` is a `Series`.
+    whose arguments these are, and whose errors it raises.
 
     - `devices`: the devices that share the runs. None is every device, of all processes after
       `jax.distributed.initialize`. A number means the first few, a sequence those of
@@ -90,7 +92,7 @@ def monte_carlo(
     """
     if slots is not None and slots < filter.num_particles:
         raise ValueError(f"slots: {slots} is no whole number of at least N, {filter.num_particles}")
-    series = as_series(observations, filter.model)
+    series = as_series(gathered(observations, inputs, missing), filter.model)
 
     def run(filter: Filter) -> FilterRun:
         starts = (keys, None)

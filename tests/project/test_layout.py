@@ -64,3 +64,32 @@ def test_imports_go_upward():
 def test_each_bug_finds_the_line_that_it_replaces():
     for name, bug in BUGS.items():
         assert (PACKAGE / bug.file).read_text(encoding="utf-8").count(bug.line) == 1, name
+
+
+# All that a reader opens to follow a step of a plain particle filter.
+CORE = """
+    checks filter memory mixture report
+    models/base models/law models/noise models/observations
+    moves/base moves/propagation/propagate
+    moves/resampling/allocation moves/resampling/ancestors moves/resampling/line
+    moves/resampling/resample moves/resampling/sorting
+    operations/compiling operations/islands operations/logarithms operations/prefix_sums
+    operations/random operations/rows operations/segments operations/stored
+"""
+
+
+def test_a_plain_step_is_in_the_core_alone():
+    """The files that it imports are those of the core, and the core imports no others."""
+    names = CORE.split()
+    reached, waiting = set(), ["filter", "moves/propagation/propagate", "moves/resampling/resample"]
+    while waiting:
+        name = waiting.pop()
+        reached.add(name)
+        modules = imported_modules(PACKAGE / f"{name}.py")
+        paths = [module.split(".")[1:] for module in modules if module.startswith("mpfjax.")]
+        # `from mpfjax.models import gaussians` imports a file of a folder.
+        files = {"/".join(path) for path in paths if (PACKAGE / "/".join(path)).suffix == ""}
+        waiting += [
+            file for file in files if (PACKAGE / f"{file}.py").exists() and file not in reached
+        ]
+    assert sorted(reached) == sorted(names)

@@ -25,7 +25,7 @@ GONE = {
 ALONE = {
     "num_components": {"Filter", "ParticleMixture"},
     "function": {"smoothed_sums", "FixedLagSmoother"},
-    "missing": {"run_filter"},
+    "missing": {"run_filter", "monte_carlo", "run_islands"},
     "order": {"partitioned_sampling"},
 }
 # Different defaults under one name, because they count or bound different things.
@@ -45,6 +45,7 @@ DIFFERENT = {
     "regroup_every",  # a Gaussian of two modes loses both, a component of particles does not
     "resample",  # where None is the one that fits the number of targets
     "threshold",  # a share of islands; grey levels
+    "within",  # propagations; a mixture, of which there is nothing outside a step
 }
 
 
