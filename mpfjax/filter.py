@@ -94,7 +94,7 @@ class Filter(eqx.Module):
         now = self._now()
         for move in (*self.initial_moves, *self.moves):
             move.check(now, self.num_particles, self.num_components)
-        memory_of(self.moves, self.model, self.num_components)
+        memory_of(self.moves, now, self.num_components)
         if self._keeps_parents:
             each = enumerate(self.moves)
             first = next((t for t, move in each if isinstance(move, AbstractPropagation)), 0)
@@ -175,7 +175,10 @@ class Filter(eqx.Module):
     ) -> Step:
         """The step with this y_t and u_t."""
         model = with_inputs(self.model, inputs)
-        return Step(model, observation, inputs=inputs, moves=self.moves, is_initial=is_initial)
+        return Step(
+            model, observation, inputs=inputs, initial_model=self.model, moves=self.moves,
+            is_initial=is_initial,
+        )  # fmt: skip
 
     def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
         return law_of(self.model).sample_initial(key, self.num_particles, self.initial_noise)
@@ -194,8 +197,8 @@ class Filter(eqx.Module):
             draw = self._sample_initial
             particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
         mixture = single_component(particles, self.num_components)
-        mixture = mixture.replace(memory=memory_of(self.moves, self.model, self.num_components))
         now = self._now(observation, inputs, is_initial=True)
+        mixture = mixture.replace(memory=memory_of(self.moves, now, self.num_components))
         for move_key, move in zip(keys, self.initial_moves, strict=True):
             mixture = move(move_key, mixture, now)
         if self.weighs_initially:
@@ -212,17 +215,15 @@ class Filter(eqx.Module):
     ) -> tuple[ParticleMixture, StepInfo]:
         """A step; without an observation it only predicts."""
         now, mixture = self._now(observation, inputs), mixture.at_step()
-        increment = jnp.zeros((), mixture.log_weights.dtype)
         for move_key, move in zip(split(key, len(self.moves)), self.moves, strict=True):
             if self._keeps_parents and isinstance(move, AbstractPropagation):
                 mixture = mixture.with_parents()
             moved = check_result(move(move_key, mixture, now), mixture, move)
             if observation is not None and not move.keeps_mass:
-                moved, log_growth = moved.normalised(mixture)
-                increment += log_growth
+                moved = moved.normalised_within(mixture)
             mixture = moved
-        mixture, additions = after_step(mixture, now, increment)
-        report = report_of(mixture, increment, **additions)
+        mixture, additions = after_step(mixture, now)
+        report = report_of(mixture, **additions)
         return mixture.replace(within=None, periods=periods_of(now.model)), report
 
 

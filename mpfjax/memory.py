@@ -8,7 +8,7 @@ the moves nor the filter need to know it.
 from typing import Any, NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
 
 class Offspring(NamedTuple):
@@ -36,11 +36,16 @@ class Memory(eqx.Module):
         """The memory after particles were redrawn."""
         return self
 
-    def after_step(
-        self, mixture: Any, now: Any, increment: Float[Array, ""]
-    ) -> tuple["Memory", dict[str, PyTree]]:
-        """The memory after a step, and what it adds to the report, by field of `StepInfo`."""
+    def after_step(self, mixture: Any, now: Any) -> tuple["Memory", dict[str, PyTree]]:
+        """The memory after a step, and what it changes in the report, by field of `StepInfo`."""
         return self, {}
+
+    def check_run(self, num_steps: int) -> None:
+        """Raise a `ValueError` for a run of fewer steps than the memory needs."""
+
+    def warning(self) -> str:
+        """What a run that ends with this memory has to warn of; nothing by default."""
+        return ""
 
 
 def kept_slot(memory: dict[str, PyTree]) -> Int[Array, ""] | None:
@@ -60,19 +65,30 @@ def after_resampling(before: Any, after: Any, offspring: Offspring) -> Any:
     return after
 
 
+def check_run(memory: dict[str, PyTree], num_steps: int) -> None:
+    """Raise a `ValueError` for a run of fewer steps than a memory needs."""
+    for entry in memory.values():
+        if isinstance(entry, Memory):
+            entry.check_run(num_steps)
+
+
+def warnings_of(memory: dict[str, PyTree]) -> list[str]:
+    """What a run that ends with these memories has to warn of."""
+    texts = [entry.warning() for entry in memory.values() if isinstance(entry, Memory)]
+    return [text for text in texts if text]
+
+
 def at_start(mixture: Any) -> Any:
     """The mixture, whose memories are those of particles without a past."""
     new = {k: v.at_start(mixture) for k, v in mixture.memory.items() if isinstance(v, Memory)}
     return mixture.replace(memory=mixture.memory | new) if new else mixture
 
 
-def after_step(
-    mixture: Any, now: Any, increment: Float[Array, ""]
-) -> tuple[Any, dict[str, PyTree]]:
-    """The mixture whose memories have heard of the step, and what they add to its report."""
+def after_step(mixture: Any, now: Any) -> tuple[Any, dict[str, PyTree]]:
+    """The mixture with its memories after the step, and what they add to the step's report."""
     report: dict[str, PyTree] = {}
     for name, entry in mixture.memory.items():
         if isinstance(entry, Memory):
-            entry, added = entry.after_step(mixture, now, increment)
+            entry, added = entry.after_step(mixture, now)
             mixture, report = mixture.replace(memory=mixture.memory | {name: entry}), report | added
     return mixture, report

@@ -1,7 +1,6 @@
 """The particle mixture: one set of joint weights, and all that is derived from it."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from operator import attrgetter
@@ -20,7 +19,6 @@ from mpfjax.operations.logarithms import (
     default_float,
     exp,
     finite_max,
-    finite_or_zero,
     log_or_nothing,
     log_sum_exp,
     scaled_exp,
@@ -55,17 +53,23 @@ class MarginalisedState(NamedTuple):
     covariance: Float[Array, "*n d d"]
 
 
+# Ancestor indices of particles that have no single ancestor in the step before.
+NO_ANCESTOR, BEGAN_ANEW = -1, -2
+
+
 class Within(eqx.Module):
     """What a mixture carries from move to move within a step, and nowhere else.
 
     - `parents`: x_{t-1} of each particle after the propagation, where a move of the chain asks for
       it (`AbstractMove.needs_parents`).
     - `resampled`: (m,), which of the components that the step began with have been resampled.
+    - `log_increment`: the growth of the total weight so far, as a logarithm.
     - `in_order`: whether a move has put each component's particles in an order, along which a
       propagation that follows spreads its point sets.
     """
 
     resampled: Bool[Array, " m"]
+    log_increment: Float[Array, ""]
     parents: PyTree = None
     in_order: bool = eqx.field(static=True, default=False)
 
@@ -82,9 +86,9 @@ class ParticleMixture(eqx.Module):
     - `particles`: a pytree whose leaves have a leading axis n, the states X.
     - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
     - `component_indicators`: C, shape (n,), in [0, num_components).
-    - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from,
-      -1 where it came from no single one (`AbstractMove.keeps_parents`). If only some are -1, their
-      states began anew; see `began_anew`.
+    - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from;
+      -1 where it came from no single one (`AbstractMove.keeps_parents`), -2 where its state began
+      anew some steps before, in `with_start` and `with_restarts`.
     - `num_components`: M, the most components that there can be, dead ones included; static. The
       filters of the literature call it `max_components`.
     - `memory`: the memory that moves keep from step to step, by the move's name.
@@ -136,10 +140,8 @@ class ParticleMixture(eqx.Module):
 
     @property
     def began_anew(self) -> Bool[Array, " n"]:
-        """Which slots hold a state that began anew some steps before, by `with_restarts`."""
-        is_orphan = self.ancestor_indices < 0
-        # Where none has an ancestor, they were drawn from several, or from a density.
-        return is_orphan & ~jnp.all(is_orphan)
+        """Which slots hold a state that began anew some steps before (`with_restarts`)."""
+        return self.ancestor_indices == BEGAN_ANEW
 
     @property
     def weights(self) -> Float[Array, " n"]:
@@ -375,35 +377,13 @@ class ParticleMixture(eqx.Module):
         )
         return normal, log_scale + log_total
 
-    def joined(self, other: "ParticleMixture") -> "ParticleMixture":
-        """The mixture with the usable particles of another one in the slots after its own.
-
-        Both bring their mass, `other` that of one island for the share of each: whatever their
-        scales are, the masses add up. `usable_slots` says how many slots belong to each, of which
-        the mixture must have enough; those of both are usable then. Memory is the mixture's.
-        """
-        first = jnp.asarray(self.num_usable_slots, jnp.int32)
-        number = jnp.asarray(other.num_usable_slots, jnp.int32)
-        place = jnp.arange(self.num_particles, dtype=jnp.int32) - first
-        is_new = (place >= 0) & (place < number)
-        rank = jnp.clip(place, 0, other.num_particles - 1)
-        log_scale = jnp.maximum(self.log_scale, other.log_scale)
-        # One of them may be without any mass.
-        log_scale = finite_or_zero(log_scale)
-        log_share = (other.log_scale - log_scale) - math.log(num_islands())
-        brought = other.replace(log_weights=other.log_weights + log_share).at(rank)
-        own = self.replace(log_weights=self.log_weights + (self.log_scale - log_scale))
-        slots = select_rows(is_new, *map(attrgetter(*_OF_SLOTS), (brought, own)))
-        slots = dict(zip(_OF_SLOTS, slots, strict=True))
-        joined = own.replace(**slots, log_scale=log_scale, usable_slots=first + number)
-        return joined._within(parents=None)
-
     def at_step(self) -> "ParticleMixture":
         """The mixture at the beginning of a step, each particle its own ancestor."""
         own = jnp.arange(self.num_particles, dtype=jnp.int32)
         if num_islands() > 1:
             own += self.num_particles * island_index()
-        within = Within(resampled=jnp.zeros(self.num_components, bool))
+        no_growth = jnp.zeros((), self.log_weights.dtype)
+        within = Within(jnp.zeros(self.num_components, bool), no_growth)
         return self.replace(ancestor_indices=own, t=self.t + 1, within=within, periods=None)
 
     @property
@@ -427,6 +407,12 @@ class ParticleMixture(eqx.Module):
     def with_resampled_of(self, other: "ParticleMixture") -> "ParticleMixture":
         """The mixture in which only these components count as resampled, whatever was since."""
         return self if other.within is None else self._within(resampled=other.within.resampled)
+
+    def normalised_within(self, previous: "ParticleMixture") -> "ParticleMixture":
+        """The mixture of a step, `normalised`, with the growth of its weight in `log_increment`."""
+        normal, log_growth = self.normalised(previous)
+        assert self.within is not None
+        return normal._within(log_increment=self.within.log_increment + log_growth)
 
     def with_order(self, in_order: bool) -> "ParticleMixture":
         """The mixture of a step in which each component's particles are in an order, or not."""
@@ -475,7 +461,7 @@ _OF_SLOTS = ("particles", "log_weights", "component_indicators", "ancestor_indic
 
 def no_ancestors(mixture: ParticleMixture) -> Int[Array, " n"]:
     """The ancestor indices of particles that come from no single one."""
-    return jnp.full_like(mixture.ancestor_indices, -1)
+    return jnp.full_like(mixture.ancestor_indices, NO_ANCESTOR)
 
 
 def single_component(

@@ -46,7 +46,6 @@ class StepInfo(eqx.Module):
 
 def report_of(
     mixture: ParticleMixture,
-    increment: Float[Array, ""],
     **additions: Array,
 ) -> StepInfo:
     """The report of a step that ended in this mixture, with what its memories add."""
@@ -54,13 +53,14 @@ def report_of(
     # It is a diagnosis: the gradient of a run need not go through it at every step.
     squares = jnp.sum(jnp.exp(2 * jax.lax.stop_gradient(mixture.log_weights)))
     sizes = mixture.component_effective_sample_sizes
-    return StepInfo(
-        log_likelihood_increment=increment,
-        effective_sample_sizes=sizes,
-        effective_sample_size=1 / squares,
-        mixture_weights=mixture.mixture_weights,
-        resampled=mixture.within.resampled,
-        degenerate=increment == -jnp.inf,
-        labels_ran_out=jnp.all(sizes > 0) & (mixture.num_components > 1),
-        **additions,
-    )
+    increment = mixture.within.log_increment
+    fields = {
+        "log_likelihood_increment": increment,
+        "effective_sample_sizes": sizes,
+        "effective_sample_size": 1 / squares,
+        "mixture_weights": mixture.mixture_weights,
+        "resampled": mixture.within.resampled,
+        "degenerate": increment == -jnp.inf,
+        "labels_ran_out": jnp.all(sizes > 0) & (mixture.num_components > 1),
+    }
+    return StepInfo(**fields | additions)

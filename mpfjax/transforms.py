@@ -7,7 +7,6 @@ from typing import Any
 from mpfjax.checks import Count, InnerShare, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead, PilotLookahead
-from mpfjax.moves.alarm import WatchStart
 from mpfjax.moves.base import (
     AbstractMove,
     AbstractPropagation,
@@ -23,7 +22,8 @@ from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.moves.start.start import Begin, Start
+from mpfjax.moves.start.alarm import WatchStart
+from mpfjax.moves.start.restart import Restart
 
 
 @checked
@@ -142,7 +142,7 @@ def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
     very wide, `with_start`.
     """
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
-    if num_draws > 1 and _begins(filter):
+    if num_draws > 1 and any(move.at_start for move in _restarts(filter)):
         raise ValueError("filter: its x_0 is chosen by more observations than y_1, by with_start")
     if num_draws == 1:
         return filter.replace(initial_moves=others)
@@ -152,65 +152,69 @@ def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
 
 @checked
 def with_start(filter: Filter, num_observations: Count = 8) -> Filter:
-    """The filter that begins by a tempered sampler on its first L observations.
+    """The filter whose state is drawn anew at step L, by a tempered sampler on y_1..y_L.
 
-    In these steps it costs as much as some 800 of a plain filter where the prior is wide, little
-    where it is not; Ẑ stays unbiased, and derivatives in these steps are the score. It takes the
-    place of a choice of x_0 by y_1 alone. Online, give y_1 to `filter.init` as well as to the first
-    step. Raises `ValueError` for a model without `log_initial`, a density in all numbers of the
-    state, whose x_0 is not made of noise either. Use it where the prior is very wide, as of a pose
-    in a building: few draws of x_0 are near a mode then, and chance decides its mass.
-    `num_observations` is L: as many as tell the modes, also of restarts.
+    Before step L the filter runs as it is, and its increments are reported as zero; at step L the
+    particles are draws of p(x_L | y_1..y_L), and the increment is log p(y_1..y_L), so that Ẑ is
+    unbiased. See `Restart`. It costs as much as some 800 steps of a plain filter where the prior is
+    diffuse, little where it is not. Smoothing and derivatives of these steps are refused. Raises
+    `ValueError` for a model without `log_initial`, a density in all coordinates of the state, whose
+    x_0 is not made of noise either, for a conditionally linear model, and in a run of fewer than L
+    steps. Use it where the prior is very diffuse, as of a pose in a building: few draws of x_0 are
+    near a mode then, and chance decides its weight.
+    `num_observations` is L: as many as tell the modes apart, also of restarts.
     """
-    if _begins(filter):
+    if any(move.at_start for move in _restarts(filter)):
         raise ValueError("filter: it has a start by its first observations already")
-    return _with_window(filter, num_observations, at_first=True)
+    initial = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
+    if not all(map(_regroups, initial)):
+        what = "its initial moves do more than regroup, and a start replaces x_0"
+        raise ValueError(f"filter: {what}")
+    filter = filter.replace(initial_moves=initial)
+    return _with_restart(filter, num_observations=num_observations, at_start=True)
 
 
 @checked
 def with_restarts(
     filter: Filter, *, probability: InnerShare = 1e-3, num_observations: Count = 8
 ) -> Filter:
-    """The filter that finds a state again which begins anew: a start where the alarm rings.
+    """The filter that finds a state again which begins anew, by a restart where the alarm rings.
 
-    The alarm is that of `with_alarm`, of N draws if there is none yet. Where it has risen for L
-    steps or more, a start on the last L observations is joined to the hypotheses by its evidence
-    and p. That step costs as much as a start. A state that begins anew is found L steps later at
-    the earliest. See `Start` for what Ẑ is unbiased for. Of a filter with restarts or a start it
-    changes the settings. Raises `ValueError` for a model that `with_start` refuses. Use it where
-    all hypotheses may be wrong for good: a robot that is carried away, a lost target.
+    The alarm is that of `with_alarm`, of N draws if there is none yet. Where its sum has been above
+    zero for L steps or more, a sample of p(x_t | the last L observations) is joined to the
+    hypotheses by its evidence and p. That step costs as much as a start. A state that begins anew
+    is found L steps later at the earliest. See `Restart` for what Ẑ is unbiased for. It changes the
+    settings of a filter with restarts. Raises `ValueError` for a model that `with_start` refuses.
+    Use it where all hypotheses may be wrong: a robot that is carried away, a lost target.
 
-    - `probability`: p, that of having begun anew L steps ago, where the alarm rings.
-    - `num_observations`: L: as many as tell the modes, also of a start.
+    - `probability`: p, of having begun anew L steps ago, where the alarm rings.
+    - `num_observations`: L: as many as tell the modes apart, also of a start.
     """
-    if not any(isinstance(move, WatchStart) for move in all_of(filter.moves)):
-        filter = with_alarm(filter, filter.num_particles)
-    return _with_window(filter, num_observations, _begins(filter), probability=probability)
+    alarms = [move for move in filter.moves if isinstance(move, WatchStart)]
+    alarms += [move for move in _restarts(filter) if move.probability is not None]
+    num_particles = [*(move.num_particles for move in alarms), filter.num_particles][0]
+    others = [move for move in filter.moves if not isinstance(move, WatchStart)]
+    filter = filter.replace(moves=others)
+    return _with_restart(
+        filter,
+        num_observations=num_observations,
+        probability=probability,
+        num_particles=num_particles,
+    )
 
 
-def _begins(filter: Filter) -> bool:
-    """Whether it has a start by its first observations."""
-    return any(isinstance(move, Begin) and move.at_first for move in filter.initial_moves)
+def _restarts(filter: Filter) -> list[Restart]:
+    return [move for move in filter.moves if isinstance(move, Restart)]
 
 
-def _with_window(filter: Filter, num_observations: int, at_first: bool, **settings: Any) -> Filter:
-    """The filter whose `Start` has these settings, and begins `at_first`."""
-    settings |= {"num_observations": num_observations}
-    initial: list[Any] = [move for move in filter.initial_moves if not isinstance(move, Begin)]
-    if at_first:
-        initial = [move for move in initial if not isinstance(move, SelectInitial)]
-        if not all(map(_regroups, initial)):
-            what = "its initial moves do more than regroup, and a start replaces x_0"
-            raise ValueError(f"filter: {what}")
-    first, *others = filter.moves
-    if isinstance(first, Start):
-        first = dataclasses.replace(first, **settings)
-    else:
-        last = 1 + max(t for t, move in enumerate(filter.moves) if not _regroups(move))
-        grouping = [move for move in initial if _regroups(move)]
-        first, others = Start(filter.moves[:last], grouping, **settings), filter.moves[last:]
-    initial.append(Begin(num_observations, at_first))
-    return filter.replace(moves=[first, *others], initial_moves=initial)
+def _with_restart(filter: Filter, **settings: Any) -> Filter:
+    """The filter whose `Restart` has these settings, after the last move that does not regroup."""
+    if _restarts(filter):
+        return _map_kind(filter, Restart, lambda move: dataclasses.replace(move, **settings))
+    place = 1 + max(t for t, move in enumerate(filter.moves) if not _regroups(move))
+    grouping = [move for move in filter.initial_moves if _regroups(move)]
+    restart = Restart(grouping, **settings)
+    return filter.replace(moves=[*filter.moves[:place], restart, *filter.moves[place:]])
 
 
 def _regroups(move: AbstractMove) -> bool:
@@ -228,6 +232,10 @@ def with_alarm(filter: Filter, num_particles: Count = 4096) -> Filter:
     `num_particles` draws of x_0, the same at each step, cost as much as so many particles. Use it
     where a lost target must be noticed.
     """
+    if any(move.probability is not None for move in _restarts(filter)):
+        return _map_kind(
+            filter, Restart, lambda move: dataclasses.replace(move, num_particles=num_particles)
+        )
     others = [move for move in filter.moves if not isinstance(move, WatchStart)]
     return filter.replace(moves=[*others, WatchStart(num_particles)])
 

@@ -132,16 +132,16 @@ BUGS = {
         "tests/moves/test_tempered.py",
     ),
     "a start forgets p(x_0)": Bug(
-        "moves/start/window.py",
-        "return log_prior + paths.log_before + power * paths.log_last",
-        "return 0 * log_prior + paths.log_before + power * paths.log_last",
-        "tests/moves/start/test_window.py -k unbiased",
+        "moves/start/sampler.py",
+        "return log_prior + paths.log_past + power * paths.log_likelihood",
+        "return 0 * log_prior + paths.log_past + power * paths.log_likelihood",
+        "tests/moves/start/test_sampler.py -k unbiased",
     ),
-    "restarts forget the mass of their choice": Bug(
-        "mixture.py",
-        "log_share = (other.log_scale - log_scale) - math.log(num_islands())",
-        "log_share = jnp.zeros_like(log_scale)",
-        "tests/moves/test_restarts.py -k evidence_and",
+    "restarts forget the evidence of the old hypotheses": Bug(
+        "moves/start/restart.py",
+        "log_odds = jnp.sum(sample.log_increments - known)",
+        "log_odds = jnp.sum(sample.log_increments)",
+        "tests/moves/start/test_restart.py -k evidence_and",
     ),
     "a twisted draw's density lacks its volume": Bug(
         "lookahead/quadratics.py",

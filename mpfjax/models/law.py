@@ -57,14 +57,25 @@ class Law:
         self, key: Key[Array, ""], number: int, noise: str = "independent"
     ) -> PyTree:
         """x_0 of so many particles, made of this noise if the model has `initial_from_noise`."""
-        model = self.model
-        if noise == "independent" or not is_made_of_noise(model, "initial"):
-            draws = model.sample_initial(key, number)
-        else:
-            shape = (number, model.initial_noise_dimension)
-            draws = model.initial_from_noise(draw_noise(key, noise, shape, default_float()))
-        check_states(draws, model, "sample_initial", number)
+        if noise == "independent" or not is_made_of_noise(self.model, "initial"):
+            draws = self.model.sample_initial(key, number)
+            check_states(draws, self.model, "sample_initial", number)
+            return self.start(draws)
+        shape = (number, self.model.initial_noise_dimension)
+        return self.make_initial(draw_noise(key, noise, shape, default_float()))
+
+    def make_initial(self, noise: Float[Array, "n k"]) -> PyTree:
+        """x_0 of each particle, made of this standard normal noise."""
+        draws = self.model.initial_from_noise(noise)
+        check_states(draws, self.model, "initial_from_noise", noise.shape[0])
         return self.start(draws)
+
+    def log_initial(self, states: PyTree) -> Float[Array, " n"]:
+        """log p(x_0) of each particle."""
+        with asking(self.model, "log_initial"):
+            values = self.model.log_initial(states)
+        number = jax.tree.leaves(states)[0].shape[0]
+        return real_each(values, number, self.model, "log_initial")
 
     def move(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """x_t of each particle, from x_{t-1}."""

@@ -29,6 +29,8 @@ class Step(eqx.Module):
     """y_t; None where it is missing, and most moves then do nothing."""
     inputs: PyTree = eqx.field(default=None, kw_only=True)
     """u_t, the known inputs of the step, from which the model at u_t was made."""
+    initial_model: Any = eqx.field(default=None, kw_only=True)
+    """the filter's model without inputs, whose p(x_0) is the prior; None where it is `model`."""
     moves: "Moves" = eqx.field(default=(), kw_only=True)
     """the filter's own chain."""
     is_initial: bool = eqx.field(static=True, default=False, kw_only=True)
@@ -46,8 +48,13 @@ class Step(eqx.Module):
 
     @property
     def law(self) -> Law:
-        """The law of a step of the model."""
+        """The law of the model at u_t."""
         return law_of(self.model)
+
+    @property
+    def initial_law(self) -> Law:
+        """The law of the model without inputs, which x_0 has none of."""
+        return law_of(self.model if self.initial_model is None else self.initial_model)
 
 
 class Given(Checked):
@@ -99,10 +106,11 @@ class AbstractMove(Given):
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model or numbers of a filter that it cannot work with."""
 
-    def initial_memory(
-        self, model: AbstractStateSpaceModel, num_components: int
-    ) -> dict[str, PyTree]:
-        """The initial memory of the move, under its own name; most moves have none."""
+    def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
+        """The memory of the move at x_0, under its own name; most moves have none.
+
+        `now` has the model, and y_1 and u_1 where they are known, though y_1 may be missing there.
+        """
         return {}
 
     def around(self, reference: Any) -> "AbstractMove":
@@ -181,13 +189,11 @@ def all_of(moves: Iterable[AbstractMove], within: bool = True) -> Iterator[Abstr
         yield move
 
 
-def memory_of(
-    moves: Iterable[AbstractMove], model: AbstractStateSpaceModel, num_components: int
-) -> dict[str, PyTree]:
+def memory_of(moves: Iterable[AbstractMove], now: Step, num_components: int) -> dict[str, PyTree]:
     """The initial memory of all moves; a `ValueError` where two have one of the same name."""
     memory: dict[str, PyTree] = {}
     for move in moves:
-        own = move.initial_memory(model, num_components)
+        own = move.initial_memory(now, num_components)
         for name in sorted(own.keys() & memory.keys()):
             raise ValueError(f"moves: two of them keep the memory {name!r}, as {name_of(move)}")
         memory |= own
@@ -330,11 +336,9 @@ class AbstractWrapper(AbstractMove):
         for move in self.inner:
             move.check(now, num_particles, num_components)
 
-    def initial_memory(
-        self, model: AbstractStateSpaceModel, num_components: int
-    ) -> dict[str, PyTree]:
+    def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
         """The memory of the moves."""
-        return memory_of(self.inner, model, num_components)
+        return memory_of(self.inner, now, num_components)
 
     def around(self, reference: Any) -> Any:
         """The same with the moves around the trajectory."""

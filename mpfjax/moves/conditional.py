@@ -70,7 +70,7 @@ class ConditionalPropagation(AbstractPropagation):
         if self.move.proposal is not None:
             require(self.move.proposal, "log_density", "conditional SMC", "proposal")
 
-    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
+    def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
         """The reference slot."""
         return {REFERENCE: ReferenceSlot(self.reference.first_slot)}
 

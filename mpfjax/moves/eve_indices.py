@@ -5,9 +5,11 @@ updates it, wherever it is in a chain or within a move.
 `mpfjax.smoothing.variance.log_marginal_likelihood_variance` has the equations.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.memory import Memory, Offspring
 from mpfjax.mixture import ParticleMixture
@@ -71,11 +73,15 @@ class EveIndices(Memory):
         grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)
         return EveIndices(take(self.indices, parents), groups, log_factors + jnp.diag(grown))
 
-    def after_step(self, mixture: ParticleMixture, now, increment):
+    def after_step(
+        self, mixture: ParticleMixture, now: Any
+    ) -> tuple["EveIndices", dict[str, PyTree]]:
         """The errors of log Ẑ and of the masses; none on islands, which families may span."""
         if num_islands() > 1:
             return self, {}
-        variance = jnp.where(increment == -jnp.inf, jnp.inf, evidence_variance(mixture))
+        assert mixture.within is not None
+        is_degenerate = mixture.within.log_increment == -jnp.inf
+        variance = jnp.where(is_degenerate, jnp.inf, evidence_variance(mixture))
         return self, {
             "log_marginal_likelihood_error": jnp.sqrt(jnp.maximum(variance, 0.0)),
             "mixture_weight_errors": jnp.sqrt(jnp.maximum(mass_variances(mixture), 0.0)),

@@ -1,7 +1,5 @@
 """Every: other moves, at every k-th step only."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -52,10 +50,10 @@ class Every(AbstractWrapper):
         """The name under which the number of the step is kept."""
         return f"every {self.every}: {', '.join(type(move).__name__ for move in self.moves)}"
 
-    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
+    def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
         """The number of steps since the moves last ran, and the moves' own memory."""
         own = {self.name: {"steps": jnp.zeros((), jnp.int32)}}
-        return own | super().initial_memory(model, num_components)
+        return own | super().initial_memory(now, num_components)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None

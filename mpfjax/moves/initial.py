@@ -8,7 +8,6 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.law import law_of
 from mpfjax.models.noise import Noise
 from mpfjax.moves.base import AbstractMove, Step
 from mpfjax.moves.resampling.ancestors import draw_ancestors
@@ -28,11 +27,6 @@ MOST_TRUST = 3 / 4
 MOST_AT_ONCE = 8
 # A prior is wide where fewer draws fit y_1, and a smaller part of all.
 FEWEST, LEAST_PART = 16, 1 / 64
-
-
-def sample_initial(key, model, num_particles, noise="independent"):
-    """The particles of x_0, of this noise if the model can."""
-    return law_of(model).sample_initial(key, num_particles, noise)
 
 
 class SelectInitial(AbstractMove):
@@ -56,7 +50,7 @@ class SelectInitial(AbstractMove):
 
     Put it first among `initial_moves`, before those that regroup. Raises `ValueError` for K < 1
     and unknown noise, and in a filter without `Propagate` or `PropagateNested`. Use it where the
-    prior is somewhat wide beside the likelihood; where it is very wide, a `Start`.
+    prior is somewhat wide beside the likelihood; where it is very wide, `with_start`.
     """
 
     num_draws: Count = eqx.field(static=True, default=4)
@@ -92,7 +86,7 @@ class SelectInitial(AbstractMove):
         at_once = next(k for k in range(MOST_AT_ONCE, 0, -1) if self.num_draws % k == 0)
 
         def look(keys: Key[Array, "2"]) -> tuple[PyTree, Float[Array, "k 2"], Float[Array, ""]]:
-            drawn = sample_initial(keys[0], now.model, at_once * n, self.noise)
+            drawn = now.initial_law.sample_initial(keys[0], at_once * n, self.noise)
             log_factors, log_scale = two_looks(keys[1], now, drawn)
             return drawn, log_factors.T, log_scale
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import saying, warn
 from mpfjax.filter import Filter, with_densities
+from mpfjax.memory import check_run, warnings_of
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import Series
 from mpfjax.moves.initial import SelectInitial
@@ -76,6 +77,7 @@ def scan(
 
     if initial is None:
         initial = first_mixture(keys_initial, filter, series)
+    check_run(initial.memory, series.length)
     times = jnp.arange(1, series.length + 1) if takes_time(collect) else None
     final, outputs = jax.lax.scan(advance, initial, (keys, series, times))
     return run_of(initial, final, *outputs)
@@ -181,6 +183,8 @@ def sound(run: FilterRun, free: bool = True) -> FilterRun:
     run = with_densities(run, increments)
     if isinstance(increments, Tracer):
         return run
+    for text in warnings_of(run.final.memory):
+        warn(text)
     degenerate = np.asarray(run.degenerate)
     is_blind = degenerate.any(axis=-1) & (degenerate | (np.asarray(increments) == 0)).all(axis=-1)
     if is_blind.any():

@@ -11,10 +11,9 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 from mpfjax.checks import checked, kinds
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, require
-from mpfjax.models.law import refuse_marginalised
+from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.models.observations import Series, as_arrays, as_series, refused_where
 from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
-from mpfjax.moves.initial import sample_initial
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.random import split, uniform
 from mpfjax.running.scan import FilterRun, initial_keys, scan, sound
@@ -114,7 +113,7 @@ def renew(
     n = filter.num_particles
     first_slot = jnp.clip(jnp.floor(uniform(key_slot, ()) * n).astype(jnp.int32), 0, n - 1)
     # x_0 of every particle, drawn separately: a model may draw many of them in strata.
-    own = jax.vmap(lambda key: sample_initial(key, filter.model, 1))(split(key_initial, n))
+    own = jax.vmap(lambda key: law_of(filter.model).sample_initial(key, 1))(split(key_initial, n))
     particles = jax.tree.map(lambda leaf: leaf[:, 0], own)
     start = jax.tree.map(lambda leaf, own: put(leaf, own[0], first_slot), particles, trajectory)
     reference = Reference(trajectory, first_slot)
@@ -185,7 +184,7 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
 
 def shape_of_trajectory(model: Any, length: int) -> PyTree:
     """The shapes and types of x_0, ..., x_t of a model, t + 1 being the length."""
-    states = jax.eval_shape(lambda key: sample_initial(key, model, 1), jax.random.key(0))
+    states = jax.eval_shape(lambda key: law_of(model).sample_initial(key, 1), jax.random.key(0))
 
     def in_time(leaf: Any) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((length, *leaf.shape[1:]), leaf.dtype)

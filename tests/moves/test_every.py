@@ -74,7 +74,7 @@ class Odd(mpfjax.AbstractRegrouping):
     def regroup(self, key, mixture):
         return mixture.component_indicators, mixture.memory
 
-    def initial_memory(self, model, num_components):
+    def initial_memory(self, now, num_components):
         return {"odd": jnp.zeros(num_components)}
 
     def check(self, now, num_particles, num_components):

@@ -11,7 +11,7 @@ import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.initial import SelectInitial, trusted
 from mpfjax.smoothing import conditional_filter
-from tests.moves.start.test_window import PLACES, WithKeys
+from tests.moves.start.test_sampler import PLACES, WithKeys
 from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import ScalarLinear
 

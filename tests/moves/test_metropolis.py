@@ -22,7 +22,7 @@ class Watch(AbstractMarkovMove):
     def __call__(self, key, mixture, now):
         return mixture.replace(memory=mixture.memory | {"parents": mixture.parents})
 
-    def initial_memory(self, model, num_components):
+    def initial_memory(self, now, num_components):
         return {"parents": jnp.zeros((64, 2))}
 
 

@@ -18,7 +18,7 @@ FLOORS = {
     """,
     "moves": """
         base eve_indices conditional every regrouping resampling propagation metropolis
-        objects initial alarm start
+        objects initial start
     """,
     "vision": "files colour tracking boxes",
     "lookahead": "quadratics pilot twisted regression learned",

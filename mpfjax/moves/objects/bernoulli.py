@@ -9,7 +9,6 @@ from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
 from mpfjax.checks import Count, Share, check
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
-from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.clutter import filled, measured
 from mpfjax.models.targets import TargetsModel
 from mpfjax.moves.base import AbstractResampling, AbstractWrapper, Step
@@ -99,17 +98,15 @@ class Associate(AbstractWrapper):
     keeps_parents = False
     keeps_families = False
 
-    def initial_memory(
-        self, model: AbstractStateSpaceModel, num_components: int
-    ) -> dict[str, PyTree]:
+    def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
         """The expected number, and the labels of all components, 0 of one without an object."""
         memory = {
-            "number": getattr(model, "initial_number", jnp.zeros(())),
+            "number": getattr(now.model, "initial_number", jnp.zeros(())),
             "labels": jnp.zeros(num_components, jnp.int32),
             "next_label": jnp.ones((), jnp.int32),
             "crowded_out": jnp.zeros(()),
         }
-        return {TARGETS: memory} | super().initial_memory(model, num_components)
+        return {TARGETS: memory} | super().initial_memory(now, num_components)
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model of another kind, and where objects have no room."""

@@ -106,9 +106,9 @@ class PropagateInClusters(AbstractPropagationByObject):
         joins = model.interaction is not None or self.start == "together"
         return joins and model.num_objects > 1
 
-    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
+    def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
         """The clusters' labels, and the steps since the last contact of each two objects."""
-        num_objects = model.num_objects
+        num_objects = now.model.num_objects
         labels = jnp.arange(num_objects, dtype=jnp.int32)
         if self.start == "together":
             labels = jnp.zeros_like(labels)

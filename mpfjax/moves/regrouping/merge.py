@@ -1,7 +1,6 @@
 """Merge: components that overlap become one. Prune: improbable components are emptied."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -49,7 +48,7 @@ class Merge(AbstractRegrouping, ByFeatures):
         if self.max_deviations is None and self.max_distance is None:
             raise ValueError("max_deviations, max_distance: at least one must be given")
 
-    def initial_memory(self, model: Any, num_components: int) -> dict[str, PyTree]:
+    def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
         """How many times in a row each pair of components has overlapped, where patience counts."""
         if self.patience == 1:
             return {}

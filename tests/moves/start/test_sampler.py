@@ -1,6 +1,5 @@
-"""A sampler of the first observations: unbiased, also with hard edges, and modes of equal mass."""
+"""The sampler of a window: unbiased, also with hard edges, and modes of equal weight."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +7,8 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.start.window import (
-    Window,
-    check_start,
-    first_paths,
-    observe,
-    with_derivatives,
-)
+from mpfjax.moves.start.sampler import Window, check_initial_density, sample_window
+from tests.moves.test_marginalised import MODEL as CONDITIONALLY_LINEAR
 from tests.unbiased import assert_unbiased
 
 KEY = jax.random.key(0)
@@ -26,27 +20,13 @@ def window_of(observations, present=None):
     return Window(observations, None, jnp.asarray(present))
 
 
-def window_start(key, model, window, num_particles):
-    """N paths given the whole window, and log p(y_t | y_1..y_{t-1}) of each step."""
-    num_steps = window.present.shape[0]
-    key_first, key_steps = jax.random.split(key)
-
-    def advance(paths, step):
-        return observe(step[0], model, window, paths, step[1], num_particles)
-
-    steps = jax.random.split(key_steps, num_steps), jnp.arange(1, num_steps + 1)
-    paths = first_paths(key_first, model, num_particles, num_steps)
-    paths, log_means = jax.lax.scan(advance, paths, steps)
-    return jax.tree.map(lambda leaf: leaf[:num_particles], paths), log_means
-
-
 def starts(model, window, num_particles, num_runs, key=KEY):
     """x_L of each run, and its log Ẑ."""
 
     @jax.jit
     def start(key):
-        paths, log_means = window_start(key, model, window, num_particles)
-        return paths.states, jnp.sum(log_means)
+        sample = sample_window(key, model, window, num_particles)
+        return sample.states, jnp.sum(sample.log_increments)
 
     return jax.tree.map(np.asarray, jax.lax.map(start, jax.random.split(key, num_runs)))
 
@@ -148,31 +128,45 @@ def test_equal_modes_have_equal_masses():
     assert masses.min() > 0.01
 
 
+class Anywhere(WithKeys):
+    """A place on ten kilometres, observed to ten centimetres, with an edge of no likelihood."""
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.uniform(key, (num_particles,), minval=-5000.0, maxval=5000.0)
+
+    def log_initial(self, states):
+        return jnp.where(jnp.abs(states) < 5000, -jnp.log(10_000.0), -jnp.inf)
+
+    def sample_transition(self, key, states):
+        return states + 0.01 * jax.random.normal(key, states.shape)
+
+    def log_likelihood(self, observation, states):
+        log_density = jax.scipy.stats.norm.logpdf(observation, states, 0.1)
+        return jnp.where(states > 0, log_density, -jnp.inf)
+
+
+@pytest.mark.exactness
+def test_a_prior_a_hundred_thousand_times_as_wide_as_the_likelihood():
+    """The evidence is that of the first observation, 1 / 10 000, and of a Kalman filter after."""
+    places = np.array([4000.0, 4000.05], np.float32)
+    states, log_z = starts(Anywhere(), window_of(places), 100, 60)
+    spread = np.sqrt(2 * 0.1**2 + 0.01**2)
+    exact = -np.log(10_000) + jax.scipy.stats.norm.logpdf(0.05, 0.0, spread)
+    assert_unbiased(np.exp(log_z - exact), loosest=0.2)
+    assert np.abs(states - 4000).max() < 1
+
+
 def test_a_model_whose_x_0_cannot_be_moved_is_refused():
     class OnlyDraws(Rooms):
         log_initial = None
 
-    with pytest.raises(ValueError, match=r"OnlyDraws.* defines no log_initial"):
-        check_start(OnlyDraws(), "a start needs it")
+    class Whole(Rooms):
+        def sample_initial(self, key, num_particles):
+            return jax.random.randint(key, (num_particles, 2), 0, 3)
 
-
-@pytest.mark.weekly
-def test_the_paths_have_the_score_of_what_was_observed():
-    """Fisher's identity, beside the derivative of the Kalman filter's log-likelihood."""
-    window = window_of(PLACES, PRESENT)
-
-    def log_z(scale):
-        model = eqx.tree_at(lambda m: m.P0, PLANE, scale * PLANE.P0)
-        return kalman_filter(model, SEEN).log_marginal_likelihood
-
-    @jax.jit
-    def score(key):
-        def log_target(scale):
-            model = eqx.tree_at(lambda m: m.P0, PLANE, scale * PLANE.P0)
-            paths, _ = window_start(key, model, window, 200)
-            return jnp.mean(with_derivatives(model, window, paths, jnp.int32(4))[1])
-
-        return jax.grad(log_target)(1.0)
-
-    scores = jax.lax.map(score, jax.random.split(KEY, 40))
-    assert_unbiased(scores, float(jax.grad(log_z)(1.0)), slack=0.05)
+    with pytest.raises(ValueError, match=r"OnlyDraws defines no log_initial"):
+        check_initial_density(OnlyDraws(), "a start")
+    with pytest.raises(ValueError, match=r"Whole has int32 in x_0"):
+        check_initial_density(Whole(), "a start")
+    with pytest.raises(ValueError, match=r"is conditionally linear"):
+        mpfjax.with_start(mpfjax.particle_filter(CONDITIONALLY_LINEAR, 50))

@@ -1,0 +1,328 @@
+"""Starts and restarts: exact where the state is drawn anew, refused elsewhere; and the alarm."""
+
+import warnings
+from functools import partial
+
+import chex
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.exact import kalman_filter
+from mpfjax.moves.start.restart import Restart
+from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_sums
+from tests.marking import weekly
+from tests.moves.start.test_sampler import PLANE, WithKeys
+from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, truth
+from tests.unbiased import assert_unbiased, ratios_to
+from tests.user_models import Batched, ScalarLinear
+
+KEY = jax.random.key(0)
+STEPS, LENGTH, PROBABILITY = 9, 3, 0.01
+
+
+def observations():
+    rng = np.random.default_rng(0)
+    places = np.array([3.0, 1.0]) + np.cumsum(0.1 * rng.normal(size=(STEPS, 2)), axis=0)
+    return (places + 0.3 * rng.normal(size=(STEPS, 2))).astype(np.float32)
+
+
+def mean(mixture):
+    return mixture.mean()
+
+
+class WithDensity(WithKeys):
+    """With the density of a step."""
+
+    def log_transition(self, states, previous_states):
+        return jnp.sum(jax.scipy.stats.norm.logpdf(states, previous_states, 0.1), axis=1)
+
+
+SEEN = observations()
+GAPS = np.where(np.isin(np.arange(STEPS), [0, 5])[:, None], np.nan, SEEN)
+# Carried away after six steps; the alarm rings at once, and the restart is by the next three.
+CARRIED = np.concatenate([SEEN[:6], SEEN[:6] - 12.0])
+PLAIN = mpfjax.mixture_particle_filter(WithDensity(), 100, 3)
+START = mpfjax.with_start(PLAIN, LENGTH)
+restarts = partial(mpfjax.with_restarts, probability=PROBABILITY, num_observations=LENGTH)
+FILTER = restarts(START)
+
+
+@pytest.mark.exactness
+def test_evidence_and_moments_are_unbiased_beyond_the_window():
+    """Two observations are missing, the first among them."""
+    series = mpfjax.Series.skipping(GAPS)
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 300), START, series, mean)
+    exact = kalman_filter(PLANE, series)
+    increments = np.asarray(runs.log_likelihood_increments)
+    assert (increments[:, : LENGTH - 1] == 0).all()
+    ratios = ratios_to(exact, runs)
+    assert_unbiased(ratios, loosest=0.05)
+    assert_unbiased(ratios[:, None] * np.asarray(runs.collected)[:, -1], exact.means[-1])
+
+
+@pytest.mark.exactness
+def test_one_step_at_a_time_is_a_run_without_y_1_at_the_start():
+    """Restarts included, whose room for observations is made by the first step."""
+    run = mpfjax.run_filter(KEY, FILTER, CARRIED, mean)
+    key_start, key_steps = jax.random.split(KEY)
+    mixture = FILTER.init(key_start)
+    for t, key in enumerate(jax.random.split(key_steps, len(CARRIED))):
+        mixture, info = FILTER.step(key, mixture, CARRIED[t])
+        increment = run.log_likelihood_increments[t]
+        np.testing.assert_allclose(info.log_likelihood_increment, increment, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(mixture.mean(), run.collected[t], rtol=1e-3)
+        assert (np.asarray(mixture.ancestor_indices) == -2).all() == (t + 1 == LENGTH)
+
+
+def test_a_checkpoint_within_the_window_goes_on_to_the_bit(tmp_path):
+    mixture, _ = START.step(KEY, START.init(KEY, SEEN[0]), SEEN[0])
+    mpfjax.save_checkpoint(tmp_path / "first.npz", mixture)
+    loaded = mpfjax.load_checkpoint(tmp_path / "first.npz", like=mixture)
+    both = [START.step(KEY, each, SEEN[1])[0] for each in (mixture, loaded)]
+    chex.assert_trees_all_equal(*both)
+
+
+@pytest.mark.exactness
+def test_inputs_of_each_step_are_those_of_the_window():
+    """As a field of the model, and as matrices of each step."""
+    filter = mpfjax.with_start(mpfjax.particle_filter(Driven(), 100), LENGTH)
+    series = mpfjax.Series(OBSERVATIONS, INPUTS)
+    log_z, filtered, _ = truth()
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 300), filter, series, mean)
+    ratios = ratios_to(log_z, runs)
+    assert_unbiased(ratios, loosest=0.03)
+    last = np.asarray(runs.collected)[:, -1]
+    assert_unbiased(ratios * last, filtered[-1], loosest=0.05)
+
+
+@pytest.mark.exactness
+def test_matrices_of_each_step_are_those_of_the_window():
+    one = np.eye(1)
+    model = mpfjax.LinearGaussianModel(one, 0.1 * one, one, 0.1 * one, np.zeros(1), 4 * one)
+    matrices = {"A": np.array([0.5, 1.5, 0.7, 1.2], np.float32)[:, None, None]}
+    series = mpfjax.Series(np.array([[0.6], [1.0], [0.3], [0.8]], np.float32), matrices)
+    filter = mpfjax.with_start(mpfjax.particle_filter(model, 100), LENGTH)
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 300), filter, series, mean)
+    assert_unbiased(ratios_to(kalman_filter(model, series), runs), loosest=0.05)
+
+
+def log_evidence_with_a_restart(seen, carried, model=PLANE):
+    """log p(y), where the state began anew after so many steps with probability p."""
+    alone, before, after = (
+        kalman_filter(model, part).log_marginal_likelihood
+        for part in (seen, seen[:carried], seen[carried:])
+    )
+    return jnp.logaddexp(np.log1p(-PROBABILITY) + alone, np.log(PROBABILITY) + before + after)
+
+
+@pytest.mark.parametrize("islands", [1, *weekly([2])])
+@pytest.mark.exactness
+def test_evidence_and_moments_are_those_of_a_state_that_began_anew(islands):
+    """Of a start by the first three observations, and one by those from the seventh on."""
+
+    def run(key):
+        filter = FILTER.replace(num_particles=60)
+        return mpfjax.run_islands(key, filter, CARRIED, mean, num_islands=islands)
+
+    keys = jax.random.split(KEY, 200)
+    if islands == 1:
+        runs = mpfjax.monte_carlo(keys, FILTER, CARRIED, mean)
+    else:
+        runs = jax.jit(jax.vmap(run))(keys)
+    surprised = np.asarray(runs.surprised)
+    assert surprised[:, 6:8].all()
+    assert not surprised[:, 8:].any()
+    ratios = ratios_to(log_evidence_with_a_restart(CARRIED, 6), runs)
+    assert_unbiased(ratios, 1.0, loosest=0.05, errors=3.0)
+    if islands == 1:
+        means = kalman_filter(PLANE, CARRIED[6:]).means[-1]
+        assert_unbiased(ratios[:, None] * np.asarray(runs.collected)[:, -1], means, loosest=0.5)
+
+
+class Offset(WithDensity):
+    """A large constant in each log-likelihood, and none at all far from the observation."""
+
+    constant: float = 0.0
+    reach: float = 1e9
+
+    def log_likelihood(self, observation, states):
+        log_density = super().log_likelihood(observation, states) + self.constant
+        is_near = jnp.all(jnp.abs(states - observation[None]) < self.reach, axis=1)
+        return jnp.where(is_near, log_density, -jnp.inf)
+
+
+@pytest.mark.exactness
+@pytest.mark.parametrize("change", [{"constant": -2e4}, {"reach": 10.0}], ids=["offset", "reach"])
+def test_restarts_where_log_likelihoods_are_large_or_minus_infinity(change):
+    plain = mpfjax.mixture_particle_filter(Offset(**change), 200, 3)
+    filter = restarts(mpfjax.with_alarm(mpfjax.with_start(plain, LENGTH), 1000))
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 100), filter, CARRIED, mean)
+    constants = change.get("constant", 0.0) * len(CARRIED)
+    increments = np.asarray(runs.log_likelihood_increments, float)
+    log_z = increments.sum(axis=1) - constants
+    exact = float(log_evidence_with_a_restart(CARRIED, 6))
+    assert abs(np.median(log_z) - exact) < 0.5
+    means = kalman_filter(PLANE, CARRIED[6:]).means[-1]
+    np.testing.assert_allclose(np.median(runs.collected[:, -1], axis=0), means, atol=0.1)
+    assert np.asarray(runs.degenerate).any() == ("reach" in change)
+
+
+def test_smoothing_refuses_a_run_in_which_a_state_began_anew():
+    for plain in (PLAIN, mpfjax.gaussian_particle_filter(WithDensity(), 100)):
+        filter = mpfjax.with_start(plain, LENGTH)
+        run = mpfjax.run_filter(KEY, filter, SEEN)
+        with pytest.raises(ValueError, match="began anew"):
+            sample_trajectories(KEY, WithDensity(), run, 5)
+    with pytest.raises(ValueError, match="one parent"):
+        mpfjax.with_eve_indices(START)
+    with pytest.raises(ValueError, match="cannot keep a trajectory"):
+        conditional_filter(KEY, FILTER, CARRIED, np.zeros((13, 2), np.float32))
+
+
+@pytest.mark.exactness
+def test_online_smoothing_ends_where_a_state_begins_anew():
+    with pytest.raises(RuntimeError, match="restarts"):
+        smoothed_sums(KEY, FILTER, CARRIED, lambda before, now: now[:, 0])
+
+
+def test_derivatives_are_refused():
+    @eqx.filter_grad
+    def score(model, filter):
+        filter = filter.replace(model=model)
+        return mpfjax.run_filter(KEY, filter, SEEN[:3], mean).log_marginal_likelihood
+
+    filter = mpfjax.with_start(mpfjax.particle_filter(PLANE, 20), LENGTH)
+    with pytest.raises(ValueError, match="no derivatives"):
+        score(PLANE, filter)
+    assert any(move.biases_score for move in filter.moves)
+
+
+def test_a_start_and_restarts_are_one_whichever_comes_first():
+    both = restarts(START), mpfjax.with_start(restarts(PLAIN), LENGTH)
+    assert eqx.tree_equal(*both)
+    assert sum(isinstance(move, Restart) for move in both[0].moves) == 1
+    alarms = mpfjax.with_alarm(FILTER, 30), restarts(mpfjax.with_alarm(START, 30))
+    assert eqx.tree_equal(*alarms)
+
+
+def test_what_cannot_begin_so_is_refused():
+    with pytest.raises(ValueError, match="need every slot"):
+        mpfjax.monte_carlo(jax.random.split(KEY, 2), START, SEEN, mean, slots=120)
+    with pytest.raises(ValueError, match="first observations already"):
+        mpfjax.with_start(START)
+    with pytest.raises(ValueError, match="more observations than y_1"):
+        mpfjax.with_selected_start(START)
+    with pytest.raises(ValueError, match="defines no log_initial"):
+        mpfjax.with_start(mpfjax.particle_filter(Batched(), 50))
+    with pytest.raises(ValueError, match="num_particles: 40, of which 2 may be all of the slots"):
+        mpfjax.with_restarts(mpfjax.mixture_particle_filter(WithKeys(), 40, 12))
+    with pytest.raises(ValueError, match="2 steps, fewer than num_observations of with_start, 3"):
+        mpfjax.run_filter(KEY, START, SEEN[:2], mean)
+
+
+MODEL = ScalarLinear()
+SCALARS = np.array([0.3, -0.9, -1.2, 1.5, 1.4], np.float32)
+
+
+@pytest.mark.exactness
+def test_an_impossible_step_does_not_turn_the_alarm_off_for_ever():
+    """It counts as much as one step can, and the alarm ends when all is right again."""
+    filter = mpfjax.with_alarm(mpfjax.particle_filter(Bounded(), 200))
+    told = np.array([0.0, 50.0, 0.0, 0.0, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 0.0], np.float32)
+    surprised = np.asarray(mpfjax.run_filter(jax.random.key(0), filter, told).surprised)
+    assert not surprised[[0, 2, 3]].any()
+    assert surprised[6]
+    assert not surprised[-1]
+
+
+class Bounded(ScalarLinear):
+    """A still state from anywhere on a line, of which nothing farther than 30 is ever seen."""
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.uniform(key, (num_particles,), minval=-12.0, maxval=12.0)
+
+    def log_likelihood(self, observation, states):
+        log_density = super().log_likelihood(observation, states)
+        return jnp.where(jnp.abs(observation - states) < 30, log_density, -jnp.inf)
+
+
+@pytest.mark.exactness
+def test_a_change_of_the_model_reaches_the_alarm():
+    plain, other = mpfjax.particle_filter(MODEL, 60), ScalarLinear(m=3.0)
+    changed = mpfjax.with_alarm(plain).replace(model=other)
+    made = mpfjax.with_alarm(plain.replace(model=other))
+    runs = [mpfjax.run_filter(jax.random.key(0), f, SCALARS[:3]) for f in (changed, made)]
+    np.testing.assert_array_equal(*(run.log_evidence_against_start for run in runs))
+
+
+class Kidnapped(ScalarLinear):
+    """A walk on a line 40 units long, of which it is told where it is; its prior is the line."""
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.uniform(key, (num_particles,), minval=-20.0, maxval=20.0)
+
+    def log_initial(self, states):
+        return jnp.where(jnp.abs(states) < 20, 0.0, -jnp.inf)
+
+
+def nothing(mixture):
+    return None
+
+
+@pytest.fixture(scope="module")
+def told():
+    """Eight runs each, carried away at the twentieth step of forty or not, with each alarm."""
+    rng = np.random.default_rng(0)
+    model = Kidnapped(a=1.0, q=0.1, r=0.2)
+    plain = mpfjax.mixture_particle_filter(model, 200, 3)
+    keys, found = jax.random.split(jax.random.key(1), 8), {}
+    for carried in (True, False):
+        places = np.where(np.arange(40) < 20, -10.0, 11.0 if carried else -10.0)
+        seen = (places + 0.2 * rng.normal(size=40)).astype(np.float32)
+        for name, change in (("alarm", mpfjax.with_alarm), ("restarts", mpfjax.with_restarts)):
+            with warnings.catch_warnings(record=True, action="always") as caught:
+                run = mpfjax.monte_carlo(keys, change(plain), seen, nothing)
+            found[name, carried] = run, [str(each.message) for each in caught]
+    return found
+
+
+@pytest.mark.exactness
+@pytest.mark.parametrize("name", ["alarm", "restarts"])
+def test_an_alarm_is_given_where_all_hypotheses_are_wrong(name, told):
+    (run, messages), (calm, silence) = told[name, True], told[name, False]
+    surprised = np.asarray(run.surprised)
+    assert surprised[:, 20:23].any(axis=1).all()
+    assert not surprised[:, :20].any()
+    assert not np.asarray(calm.surprised).any()
+    said = [each for each in messages if "speaks against all hypotheses in 8 of 8 runs" in each]
+    assert len(said) == (name == "alarm")
+    assert not silence
+
+
+@pytest.mark.exactness
+def test_after_a_restart_the_state_is_found_and_the_alarm_ends(told):
+    run, _ = told["restarts", True]
+    np.testing.assert_allclose(jax.vmap(lambda m: m.mean())(run.final), 11.0, atol=0.5)
+    assert not np.asarray(run.surprised)[:, -1].any()
+
+
+def test_the_evidence_is_that_of_the_prior_beside_the_increment(told):
+    """p(y | x_0 ~ U) is 1/40 within the line, up to the constant in the model's likelihood."""
+    run, _ = told["alarm", False]
+    found = run.log_evidence_against_start + run.log_likelihood_increments
+    np.testing.assert_allclose(found, -np.log(40), atol=0.4)
+
+
+@pytest.mark.exactness
+def test_collect_sees_the_time_and_the_inputs():
+    def collect(mixture, t, inputs):
+        return t, inputs
+
+    filter = mpfjax.particle_filter(MODEL, 60)
+    times, inputs = mpfjax.run_filter(KEY, filter, SCALARS, collect).collected
+    np.testing.assert_array_equal(times, [1, 2, 3, 4, 5])
+    assert inputs is None
