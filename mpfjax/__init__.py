@@ -49,7 +49,6 @@ from mpfjax.moves.base import Step as Step
 from mpfjax.moves.every import Every as Every
 from mpfjax.moves.initial import SelectInitial as SelectInitial
 from mpfjax.moves.metropolis import AbstractMetropolis as AbstractMetropolis
-from mpfjax.moves.metropolis import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
 from mpfjax.moves.metropolis import RandomWalkMetropolis as RandomWalkMetropolis
 from mpfjax.moves.objects.bernoulli import Associate as Associate
 from mpfjax.moves.objects.exclusion import Exclusion as Exclusion
@@ -65,7 +64,6 @@ from mpfjax.moves.propagation.proposals import GaussNewtonProposal as GaussNewto
 from mpfjax.moves.propagation.proposals import NetworkProposal as NetworkProposal
 from mpfjax.moves.propagation.regimes import PropagateRegimes as PropagateRegimes
 from mpfjax.moves.propagation.regimes import RegimeProposal as RegimeProposal
-from mpfjax.moves.propagation.tempered import PropagateTempered as PropagateTempered
 from mpfjax.moves.regrouping.kmeans import KMeans as KMeans
 from mpfjax.moves.regrouping.merge import Merge as Merge
 from mpfjax.moves.regrouping.merge import Prune as Prune

@@ -29,7 +29,6 @@ from mpfjax.moves.regrouping.merge import Merge
 from mpfjax.moves.regrouping.partitions import Pool, RandomPartition
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration
-from mpfjax.moves.resampling.line import SortBy
 from mpfjax.moves.resampling.resample import Resample, Scheme
 from mpfjax.transforms import (
     with_lookahead,
@@ -51,7 +50,6 @@ def particle_filter(
     proposal: AbstractProposal | None = None,
     scheme: Scheme = "systematic",
     ess_threshold: Share = 1.0,
-    sort_by: SortBy | None = None,
     noise: Noise = "independent",
     gradient: Gradient = "none",
 ) -> Filter:
@@ -61,7 +59,7 @@ def particle_filter(
     it for a filtering distribution with one mode. If there are several, it loses all but one.
     `noise="rqmc"` is `with_point_sets`, and `gradient="stop"`, for tuning, `with_score_gradient`.
     """
-    moves = [Resample(scheme, ess_threshold=ess_threshold, sort_by=sort_by), Propagate(proposal)]
+    moves = [Resample(scheme, ess_threshold=ess_threshold), Propagate(proposal)]
     return _with(noise, gradient, Filter(model, moves, num_particles))
 
 
@@ -72,9 +70,6 @@ def auxiliary_particle_filter(
     lookahead: Lookahead,
     *,
     proposal: AbstractProposal | None = None,
-    scheme: Scheme = "systematic",
-    ess_threshold: Share = 1.0,
-    sort_by: SortBy | None = None,
 ) -> Filter:
     """The auxiliary particle filter: resample by w times a look-ahead to y_t, propagate.
 
@@ -83,13 +78,10 @@ def auxiliary_particle_filter(
     Ẑ is unbiased for any look-ahead; see `AuxiliaryResample`. With `GaussNewtonProposal(1,
     inflation=1.0)` for a `LinearGaussianModel` the filter is fully adapted: ν is p(y_t | x_{t-1}),
     x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are equal. Use it where the likelihood
-    is narrow and y_t shows early which particles will survive.
+    is narrow and y_t shows early which particles will survive. It is `with_lookahead` of a
+    `particle_filter`, and so of any other filter.
     """
-    plain = particle_filter(
-        model, num_particles, proposal=proposal, scheme=scheme, ess_threshold=ess_threshold,
-        sort_by=sort_by,
-    )  # fmt: skip
-    return with_lookahead(plain, lookahead)
+    return with_lookahead(particle_filter(model, num_particles, proposal=proposal), lookahead)
 
 
 @checked
@@ -212,9 +204,6 @@ def partitioned_sampling(
     model: MultiObjectModel,
     num_particles: Count,
     order: str | Sequence[int] | Array | None = None,
-    *,
-    scheme: Scheme = "systematic",
-    ess_threshold: Share = 1.0,
 ) -> Filter:
     """Partitioned sampling: resample, then move one object after the other.
 
@@ -223,11 +212,9 @@ def partitioned_sampling(
     every step. It needs far fewer particles than the joint particle filter, `particle_filter` on
     the same model. But the first objects of the order keep only a few distinct hypotheses, and
     hardly recover from an occlusion. It is unbiased in every order, also with an interaction.
-    `scheme` and `ess_threshold` are those of the resampling between steps and objects.
+    `map_moves` changes its resampling, between steps and objects.
     """
-    between = Resample(scheme, ess_threshold=ess_threshold, allocation="equal")
-    moves = [Resample(scheme, ess_threshold=ess_threshold), Partitioned(order, resample=between)]
-    return Filter(model, moves, num_particles)
+    return Filter(model, [Resample(), Partitioned(order)], num_particles)
 
 
 @checked
@@ -236,9 +223,6 @@ def distributed_partitioned_sampling(
     num_particles: Count,
     orders: str | Sequence[Sequence[int]] | Array | None = None,
     reassembly: Reassembly = "prior",
-    *,
-    scheme: Scheme = "systematic",
-    ess_threshold: Share = 1.0,
 ) -> Filter:
     """DPS: the particles are dealt into C sets, and the objects move in another order in each.
 
@@ -252,21 +236,17 @@ def distributed_partitioned_sampling(
     all.
     """
     orders = "circular" if orders is None else orders
-    between = Resample(scheme, ess_threshold=ess_threshold, allocation="equal")
-    partitioned = Partitioned(orders, resample=between, reassembly=reassembly)
-    resample = Resample(scheme, ess_threshold=ess_threshold)
+    partitioned = Partitioned(orders, reassembly=reassembly)
     return Filter(
         model,
-        moves=[Pool(), resample, RandomPartition(), partitioned],
+        moves=[Pool(), Resample(), RandomPartition(), partitioned],
         num_particles=num_particles,
         num_components=model.num_objects if isinstance(orders, str) else len(partitioned.orders),
     )
 
 
 @checked
-def independent_particle_filters(
-    model: MultiObjectModel, num_particles: Count, *, scheme: Scheme = "systematic"
-) -> Filter:
+def independent_particle_filters(model: MultiObjectModel, num_particles: Count) -> Filter:
     """A small particle filter for each object, as if there were no other.
 
     Each object has N particles, at the cost of a joint filter of N. It is exact where the objects
@@ -275,7 +255,7 @@ def independent_particle_filters(
     `PropagateIndependently`.
     """
     ignores = model.interaction is not None
-    move = PropagateIndependently(scheme=scheme, ignores_interaction=ignores)
+    move = PropagateIndependently(ignores_interaction=ignores)
     return Filter(model, [move], num_particles)
 
 
@@ -285,8 +265,6 @@ def clustered_particle_filter(
     num_particles: Count,
     *,
     start: Literal["apart", "together"] = "apart",
-    split_after: Count | None = None,
-    scheme: Scheme = "systematic",
 ) -> Filter:
     """A joint filter of clusters of objects; clusters merge where objects meet.
 
@@ -299,12 +277,11 @@ def clustered_particle_filter(
     derivation, the options and what the object model must define.
 
     Use it instead of a joint filter, PS or DPS wherever ψ has compact support, as in
-    `PairwiseRepulsion(compact=True)`. Otherwise all objects become one cluster at once. Estimates
+    `PairwiseRepulsion`. Otherwise all objects become one cluster at once. Estimates
     are after resampling. A cluster's distribution may have several modes, such as two look-alikes
     in either order. Their mean is then a place where no object is: take a median.
     """
-    move = PropagateInClusters(start, split_after, scheme=scheme)
-    return Filter(model, moves=[move], num_particles=num_particles)
+    return Filter(model, [PropagateInClusters(start)], num_particles)
 
 
 @checked

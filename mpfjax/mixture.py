@@ -231,17 +231,14 @@ class ParticleMixture(eqx.Module):
         """The group of each component, where the particles of each are of one."""
         return jnp.round(self.component_averages(groups)).astype(jnp.int32)
 
-    def component_means(self, periods: PyTree = None) -> PyTree:
+    def component_means(self) -> PyTree:
         """The weighted mean of each component: every leaf (m, ...), NaN for a dead one.
 
-        Leaves that are not floating point are averaged as `component_averages` does.
-
-        - `periods`: of the numbers that go round, as angles do, in the form of one state: for a
-          pose `np.array([0, 0, 2 * np.pi])`, zero for what does not. Their mean is the direction of
-          the mean vector on the circle (Mardia and Jupp 2000), and at most half a period. None
-          takes those of the model.
+        Leaves that are not floating point are averaged as `component_averages` does. Of what goes
+        round, by the model's `periods`, it is the direction of the mean vector on the circle
+        (Mardia and Jupp 2000), and at most half a period.
         """
-        means = _averages(self.component_averages, self.particles, self._periods(periods))
+        means = _averages(self.component_averages, self.particles, self.periods)
         if isinstance(means, MarginalisedState):
             within = self._component_spread(self.particles.mean)
             means = means._replace(covariance=means.covariance + within)
@@ -249,13 +246,12 @@ class ParticleMixture(eqx.Module):
         nowhere = jax.tree.map(partial(jnp.full_like, fill_value=jnp.nan), means)
         return select_rows(self.active, means, nowhere)
 
-    def component_covariances(self, periods: PyTree = None) -> Float[Array, "m d d"]:
+    def component_covariances(self) -> Float[Array, "m d d"]:
         """The weighted covariance of each component's flattened state, zero for a dead one.
 
-        With `periods`, see `component_means`, what goes round differs from its mean by the shorter
-        way.
+        What goes round, by the model's `periods`, differs from its mean by the shorter way.
         """
-        if (periods := self._periods(periods)) is not None:
+        if (periods := self.periods) is not None:
             shapes = jax.tree.map(lambda leaf: leaf[:1].shape, points(self.particles))
             every = jax.tree.map(jnp.broadcast_to, points(periods), shapes)
             periods = flatten_states(every)[0]
@@ -277,12 +273,12 @@ class ParticleMixture(eqx.Module):
             centred -= periods[None] * turns
         return self.component_averages(centred[:, :, None] * centred[:, None, :])
 
-    def mean(self, periods: PyTree = None) -> PyTree:
+    def mean(self) -> PyTree:
         """E[x_t | y_1..y_t], leaf by leaf, over the whole mixture; see `average`.
 
-        `periods` is that of `component_means`.
+        Of what goes round it is the mean on the circle, as for `component_means`.
         """
-        means = _averages(self.average, self.particles, self._periods(periods))
+        means = _averages(self.average, self.particles, self.periods)
         if not isinstance(means, MarginalisedState):
             return means
         centred = self.particles.mean - means.mean[None]
@@ -444,9 +440,6 @@ class ParticleMixture(eqx.Module):
     def replace(self, **fields: PyTree) -> "ParticleMixture":
         """A copy with some fields changed."""
         return dataclasses.replace(self, **fields)
-
-    def _periods(self, given: PyTree) -> PyTree:
-        return self.periods if given is None else given
 
     def _require_one(self) -> None:
         shape = self.log_weights.shape

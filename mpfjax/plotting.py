@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from mpfjax.checks import CountOrZero, Share, checked, shown
+from mpfjax.checks import CountOrZero, checked, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 
 # Okabe and Ito's palette (2008), which people with colour blindness can tell apart.
@@ -16,6 +16,8 @@ COLOURS = (
     "#56B4E9", "#F0E442", "#8B4513", "#5E3C99", "#666666",
 )  # fmt: skip
 MARKERS = "osD^vP*X<>"
+# A component of less mass is hardly darker than the paper, and many would fill the legend.
+_LEAST_MASS = 0.01
 
 
 @checked
@@ -24,8 +26,6 @@ def draw_components(
     index: CountOrZero = 0,
     *,
     truth: np.ndarray | None = None,
-    periods: PyTree = None,
-    least_mass: Share = 0.01,
 ) -> Figure:
     """Each component's mean and two standard deviations over time, the darker the heavier.
 
@@ -35,8 +35,9 @@ def draw_components(
     - `mixtures`: with a leading axis of time, as `run_filter(..., collect=None).collected`.
     - `index`: which number of the flattened state is drawn; of a `MarginalisedState` the latent
       comes first, then x.
-    - `periods`: of what goes round, as in `ParticleMixture.component_means`.
-    - `truth`: (t,), a line in black. `least_mass`: components of less mass are left out.
+    - `truth`: (t,), a line in black.
+
+    Components of less than a hundredth of the mass are left out.
 
     Raises `ValueError` for an index that the state has not, and for mixtures without an axis of
     time. Use it to see where modes part, and how much of the mass each has.
@@ -45,8 +46,8 @@ def draw_components(
         raise ValueError("mixtures: these are not all of one run; keep them by collect=None")
 
     def moments(mixture: ParticleMixture) -> tuple[Array, Array, Array]:
-        means = flatten_states(mixture.component_means(periods))
-        covariances = mixture.component_covariances(periods)
+        means = flatten_states(mixture.component_means())
+        covariances = mixture.component_covariances()
         # Rounding may leave a variance of zero slightly negative.
         variances = jnp.maximum(covariances.diagonal(axis1=1, axis2=2), 0.0)
         return mixture.mixture_weights, means, variances
@@ -58,7 +59,7 @@ def draw_components(
     axis = figure.subplots()
     times = np.arange(1, len(masses) + 1)
     for m in range(masses.shape[1]):
-        alive = (masses[:, m] > 0) & (masses[:, m] >= least_mass)
+        alive = masses[:, m] >= _LEAST_MASS
         if not alive.any():
             continue
         mean, deviation = means[alive, m, index], np.sqrt(variances[alive, m, index])

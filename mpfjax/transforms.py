@@ -27,20 +27,24 @@ from mpfjax.moves.start.restart import Restart
 
 
 @checked
-def map_moves(filter: Filter, change: Callable[[Any], Any], *, within: bool = True) -> Filter:
+def map_moves(filter: Filter, change: Callable[[Any], Any]) -> Filter:
     """The filter with `change(move)` in the place of each move.
 
     It reaches the moves that others hold first, as those of an `Every`, and the resampling within a
     `Partitioned`:
 
         map_moves(filter, lambda m: Resample("stratified") if isinstance(m, Resample) else m)
-
-    - `within`: whether also those that propagations hold, or the chain's own moves alone.
     """
+    return _mapped(filter, AbstractMove, change, within=True)
+
+
+def _mapped(filter: Filter, kind: Any, change: Callable[[Any], Any], within: bool) -> Filter:
+    """The filter with its moves of this kind changed, also those within propagations or not."""
 
     def changed(move: AbstractMove) -> Any:
         enters = within or not isinstance(move, AbstractPropagation)
-        return change(move.map_inner(changed) if enters else move)
+        move = move.map_inner(changed) if enters else move
+        return change(move) if isinstance(move, kind) else move
 
     return filter.replace(
         moves=[changed(move) for move in filter.moves],
@@ -50,7 +54,7 @@ def map_moves(filter: Filter, change: Callable[[Any], Any], *, within: bool = Tr
 
 def _map_kind(filter: Filter, kind: Any, change: Callable[[Any], Any]) -> Filter:
     """The same of the chain's own moves of this kind alone."""
-    return map_moves(filter, lambda m: change(m) if isinstance(m, kind) else m, within=False)
+    return _mapped(filter, kind, change, within=False)
 
 
 def _require_resample(filter: Filter, what: str) -> None:

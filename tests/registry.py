@@ -5,6 +5,7 @@
 new move or filter is one new line below; the tests then find it.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -21,12 +22,10 @@ from mpfjax import (
     GroupBy,
     KMeans,
     Merge,
-    MetropolisAdjustedLangevin,
     MultiObjectModel,
     Partitioned,
     Pool,
     Propagate,
-    PropagateTempered,
     RandomPartition,
     RandomWalkMetropolis,
     Resample,
@@ -107,17 +106,15 @@ def _chain(*before, m: int = NUM_COMPONENTS, then=(), proposal=None) -> Callable
 
 
 def _metropolis(m: int) -> Callable[..., Filter]:
-    """A likelihood in two stages, with a Metropolis move of each kind after it is resampled by."""
+    """A Metropolis move, twice, after the particles are resampled by the likelihood."""
 
     def make(model):
         moves = [
             Predict(),
-            Reweight(0.3),
-            Resample("stratified"),
-            RandomWalkMetropolis(2, exponent=0.3),
-            Reweight(0.7),
-            Resample(ess_threshold=0.9),
-            MetropolisAdjustedLangevin(),
+            Reweight(),
+            Resample("stratified", ess_threshold=0.9),
+            RandomWalkMetropolis(),
+            RandomWalkMetropolis(),
             KMeans(2),
         ]
         initial = [KMeans(3, reseed=True)] if m > 1 else []
@@ -216,21 +213,18 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "guided mpf rqmc of families": lambda model: mpfjax.with_proposals_per_particle(
         _mpf(proposal=GaussNewtonProposal(), noise="rqmc")(model), 3
     ),
-    "in stages": lambda model: Filter(
-        model,
-        [Resample(), PropagateTempered(exponents=(0.1, 0.4, 1.0)), KMeans()],
-        NUM_PARTICLES,
-        NUM_COMPONENTS,
-        initial_moves=[KMeans(3, reseed=True)],
-        initial_noise="rqmc",
-    ),
     "predict and weigh": lambda model: Filter(
         model, [Resample(), Predict(), Reweight()], NUM_PARTICLES
     ),
     "joint pf": _joint(_pf()),
     "ps adaptive, random order": _joint(
-        lambda joint: mpfjax.partitioned_sampling(
-            joint, NUM_PARTICLES, "random", scheme="multinomial", ess_threshold=0.5
+        lambda joint: mpfjax.map_moves(
+            mpfjax.partitioned_sampling(joint, NUM_PARTICLES, "random"),
+            lambda move: (
+                dataclasses.replace(move, scheme="multinomial", ess_threshold=0.5)
+                if isinstance(move, Resample)
+                else move
+            ),
         )
     ),
     "dps": _joint(

@@ -23,17 +23,17 @@ def test_components_stand_where_their_moments_are():
     moves = [mpfjax.PropagateMarginalised(), mpfjax.Resample(), *by_regime]
     filter = mpfjax.Filter(SWITCHING, moves, 40, 3, initial_moves=by_regime)
     mixtures = mpfjax.run_filter(jax.random.key(0), filter, SEEN).collected
-    axis = draw_components(mixtures, 1, truth=np.zeros(len(SEEN)), least_mass=0.0).axes[0]
+    axis = draw_components(mixtures, 1, truth=np.zeros(len(SEEN))).axes[0]
     bars = [path[:, 1] for each in axis.collections for path in segments_of(each)]
     last = jax.tree.map(lambda leaf: leaf[-1], mixtures)
-    alive = np.flatnonzero(last.mixture_weights > 0)
+    alive = np.flatnonzero(last.mixture_weights >= 0.01)
     means = np.asarray(last.component_means().mean)[alive, 0]
     deviations = np.sqrt(np.asarray(last.component_means().covariance)[alive, 0, 0])
     for mean, deviation in zip(means, deviations, strict=True):
         expected = [mean - 2 * deviation, mean + 2 * deviation]
         assert any(np.allclose(bar, expected, rtol=1e-3) for bar in bars)
-    living = jax.vmap(lambda mixture: mixture.active)(mixtures)
-    assert len(bars) == np.sum(living)
+    masses = jax.vmap(lambda mixture: mixture.mixture_weights)(mixtures)
+    assert len(bars) == np.sum(masses >= 0.01) < np.sum(masses > 0)
 
 
 def test_a_mass_that_rounding_left_above_one_is_drawn():

@@ -43,9 +43,8 @@ METHODS: dict[str, tuple[str, Callable[..., mpfjax.Filter]]] = {
     "crossing": ("one cluster", partial(clusters, start="together")),
     "clusters": ("clusters", clusters),
     # Clusters that part after five steps without contact, an approximation.
-    "splitting": ("clusters that split", partial(clusters, split_after=5)),
 }
-ONE_BY_ONE = ("crossing", "clusters", "splitting")
+ONE_BY_ONE = ("crossing", "clusters")
 
 
 @command(runs=2, scenes=["e"], methods=["ps", "independent"])

@@ -142,7 +142,7 @@ def _scores(scene: Scene, found: Found, truth: np.ndarray) -> tuple[float, float
 
     metric = partial(getattr(mpfjax.metrics, scene.score), cutoff=scene.cutoff, exponent=1.0)
     steps = zip(found.places, there, found.is_told, is_there, strict=True)
-    distances = [metric(*sets, estimate_mask=a, truth_mask=b).distance for *sets, a, b in steps]
+    distances = [metric(places[a], true[b]).distance for places, true, a, b in steps]
     distance = np.mean(distances)
     error, switches = np.mean(np.abs(found.numbers - is_there.sum(axis=1))), np.nan
     if found.labels.size:

@@ -46,35 +46,28 @@ def grid_filter(
     model: Any,
     observations: PyTree,
     grid: Float[Array, " g"],
-    log_initial: Float[Array, " g"] | None = None,
     *,
     state_shape: tuple[int, ...] = (),
 ) -> GridFilterRun:
     """The recursion of Vermaak et al. (2003), eqs. 1 and 2, by quadrature on an even grid.
 
-    - `model`: has `log_transition` and `log_likelihood`; its states are scalars of shape
-      `state_shape`, () or (1,).
+    - `model`: has `log_initial`, `log_transition` and `log_likelihood`; its states are scalars of
+      shape `state_shape`, () or (1,).
     - `grid`: evenly spaced points that cover all values that x_t can have, with several points in
       the smallest standard deviation of the model. The error then falls faster than any power of
       the spacing.
-    - `log_initial`: log p(x_0) at the grid points; None calls the model's own `log_initial`.
     - `observations`: arrays, or a `Series`.
 
     Costs O(t g²). Differentiable in the model's parameters. Raises `ValueError` for a grid that is
-    not one row of evenly spaced, ascending numbers, a `log_initial` of another length, a
-    conditionally linear model or one without these densities, and for data as `run_filter` does.
-    Use it as the reference for a scalar model.
+    not one row of evenly spaced, ascending numbers, a conditionally linear model or one without
+    these densities, and for data as `run_filter` does. Use it as the reference for a scalar model.
     """
     points, width = _checked_grid(grid)
-    for density in ("log_transition", "log_likelihood"):
+    for density in ("log_initial", "log_transition", "log_likelihood"):
         require(model, density, "grid_filter")
     refuse_marginalised(model, "grid_filter", "switching_filter takes one with regimes")
-    if log_initial is None:
-        require(model, "log_initial", "grid_filter without log_initial")
-    else:
-        log_initial = real_array(str(len(points)), "log_initial", log_initial)
     series = as_series(observations, model)
-    return _grid_filter(model, series, points, width, log_initial, state_shape)
+    return _grid_filter(model, series, points, width, state_shape)
 
 
 def _width(grid: Any) -> Any:
@@ -98,10 +91,10 @@ def _checked_grid(grid: Any) -> tuple[Float[Array, " g"], Any]:
 
 
 @eqx.filter_jit
-def _grid_filter(model, series, grid, width, log_initial, state_shape):
+def _grid_filter(model, series, grid, width, state_shape):
     num_points = grid.shape[0]
     states = grid.reshape(-1, *state_shape)
-    log_prior = model.log_initial(states) if log_initial is None else log_initial
+    log_prior = model.log_initial(states)
     cell = jnp.asarray(width, grid.dtype)
 
     def kernel_of(model: Any) -> Float[Array, "g g"]:

@@ -37,7 +37,6 @@ def learn_lookahead(
     observations: PyTree,
     num_passes: Count = 5,
     *,
-    num_particles: Count | None = None,
     features: Callable[[PyTree], Array] | None = None,
 ) -> Filter:
     """Learn a filter that looks ahead to all later observations, when it resamples and when it
@@ -69,9 +68,8 @@ def learn_lookahead(
     - `filter`: of moves `Resample` (or `AuxiliaryResample`, whose look-ahead is replaced),
       `Propagate` and regrouping; its components get equal slots. Its model makes x_t of noise,
       `transition_from_noise`. Take one with components where there are modes.
-    - `num_passes`: how often the filter runs to learn.
-    - `num_particles`: of these runs. None is sixteen times as many as `filter` has, since errors
-      of ψ stay. Each pass is kept whole while ψ is fitted. Take more where a mode may be missed.
+    - `num_passes`: how often the filter runs to learn, with sixteen times its particles, since
+      errors of ψ stay. Each pass is kept whole while ψ is fitted.
     - `features`: φ, in which log ψ is nearly quadratic, (states) -> (n, d); of one particle, if the
       model is wrapped by `per_particle`. None is the flattened state.
     - `observations`: arrays, or a `Series`; steps without an observation are looked over.
@@ -83,12 +81,12 @@ def learn_lookahead(
     observations are known from the start: for log Ẑ in `metropolis_hastings` and `smc2`, to compare
     models, and for the masses of modes at the end.
     """
-    model: Any = filter.model
+    model = filter.model
     if not is_mixed(model):
         require_noise(model, "learn_lookahead")
     series = as_series(observations, model)
     twist = _knowing_nothing(key, filter, series.length, mapped(model, features) or flatten_states)
-    learners = num_particles or _LEARNERS * filter.num_particles
+    learners = _LEARNERS * filter.num_particles
     for pass_key in jax.random.split(key, num_passes):
         run_key, fit_key = jax.random.split(pass_key)
         twisted = _twisted(filter, twist, learners)

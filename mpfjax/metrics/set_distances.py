@@ -7,14 +7,13 @@ pair, and add a cost for each entry without a partner.
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from mpfjax.checks import Positive, check_shape, checked, number, to_rows
+from mpfjax.checks import Positive, checked, number, to_rows
 
 Exponent = Annotated[float, number(lambda p: 1 <= p < np.inf, "a finite number of at least 1")]
-Alpha = Annotated[float, number(lambda alpha: 0 < alpha <= 2, "a number in (0, 2]")]
 
 # Costs below this share of the largest are lost in the sums of the search.
 _FINE = 1e-8
@@ -38,8 +37,8 @@ class GOSPA(NamedTuple):
 
     - `distance`: the metric itself, in the unit of the positions.
     - `localisation`: the sum of d^exponent over the estimates paired with an object.
-    - `missed`: the cost of the objects without an estimate; where alpha is 2, it is their number
-      times cutoff^exponent / 2.
+    - `missed`: the cost of the objects without an estimate: their number times
+      cutoff^exponent / 2.
     - `false`: the cost of the estimates without an object, in the same way.
     """
 
@@ -56,22 +55,19 @@ def ospa(
     *,
     cutoff: Positive,
     exponent: Exponent = 2.0,
-    estimate_mask: Bool[np.ndarray, " k"] | None = None,
-    truth_mask: Bool[np.ndarray, " l"] | None = None,
 ) -> OSPA:
     """The optimal sub-pattern assignment distance, with its parts: localisation and cardinality.
 
     Schuhmacher, Vo and Vo (2008): for m <= n entries in the two sets, the least over
     pairings of ((sum_i min(d_i, c)^p + c^p (n - m)) / n)^(1/p), with c the `cutoff` in the unit
     of the positions and p the `exponent`. It is 0 for two empty sets and c where one is empty.
-    Entries that a mask leaves out may hold anything; a NaN in one that counts makes the distance
-    NaN where the other set is not empty. By NumPy and SciPy, in float64.
+    A NaN makes the distance NaN where the other set is not empty. By NumPy and SciPy, in float64.
 
-    Raises `ValueError` for sets that are no arrays, masks of another length, a cutoff that is not
-    positive and finite, and an exponent below 1 or infinite. Use it for an error per object;
+    Raises `ValueError` for sets that are no arrays, a cutoff that is not positive and finite, and
+    an exponent below 1 or infinite. Use it for an error per object;
     `gospa` says how many objects were missed.
     """
-    shares, found, there = _paired(estimates, truths, cutoff, exponent, estimate_mask, truth_mask)
+    shares, found, there = _paired(estimates, truths, cutoff, exponent)
     size, num_alone = max(found, there, 1), abs(found - there)
     return OSPA(
         distance=cutoff * _norm(shares, num_alone, exponent) / size ** (1 / exponent),
@@ -87,30 +83,27 @@ def gospa(
     *,
     cutoff: Positive,
     exponent: Exponent = 2.0,
-    alpha: Alpha = 2.0,
-    estimate_mask: Bool[np.ndarray, " k"] | None = None,
-    truth_mask: Bool[np.ndarray, " l"] | None = None,
 ) -> GOSPA:
     """The generalised OSPA distance, with its parts: localisation, misses and false estimates.
 
-    Rahmathullah, García-Fernández and Svensson (2017), eq. 1: for m <= n entries in the two sets,
-    the least over pairings of (sum_i min(d_i, c)^p + (c^p / alpha) (n - m))^(1/p), with c the
-    `cutoff` in the unit of the positions and p the `exponent`. The parts are those of their
-    Proposition 1: two entries paired at the cutoff or beyond are one miss and one false estimate,
-    at c^p / 2 each. With alpha below 2 the parts still add up, but an entry left over costs
-    c^p / alpha. Two empty sets are at distance 0. Numbers, masks and NaN are as in `ospa`.
+    Rahmathullah, García-Fernández and Svensson (2017), eq. 1 with alpha 2, at which each miss and
+    each false estimate costs the same: for m <= n entries in the two sets, the least over pairings
+    of (sum_i min(d_i, c)^p + (c^p / 2) (n - m))^(1/p), with c the `cutoff` in the unit of the
+    positions and p the `exponent`. The parts are those of their Proposition 1: two entries paired
+    at the cutoff or beyond are one miss and one false estimate, at c^p / 2 each. Two empty sets are
+    at distance 0. Numbers and NaN are as in `ospa`.
 
-    Raises `ValueError` as `ospa` does, and for an alpha outside (0, 2]. Use it to score trackers
-    that may lose objects or invent them, with alpha at 2.
+    Raises `ValueError` as `ospa` does. Use it to score trackers that may lose objects or invent
+    them.
     """
-    shares, found, there = _paired(estimates, truths, cutoff, exponent, estimate_mask, truth_mask)
+    shares, found, there = _paired(estimates, truths, cutoff, exponent)
     near, num_far = shares[~(shares >= 1)], np.sum(shares >= 1)
     missed, false = (
-        _times(num_far / 2 + max(number - len(shares), 0) / alpha, cutoff, exponent)
+        _times(num_far / 2 + max(number - len(shares), 0) / 2, cutoff, exponent)
         for number in (there, found)
     )
     return GOSPA(
-        distance=cutoff * _norm(shares, abs(found - there) / alpha, exponent),
+        distance=cutoff * _norm(shares, abs(found - there) / 2, exponent),
         localisation=float(np.sum((cutoff * near) ** exponent)),
         missed=missed,
         false=false,
@@ -130,7 +123,7 @@ def _times(share: float, cutoff: float, exponent: float) -> float:
 
 
 def _paired(
-    estimates: Any, truths: Any, cutoff: float, exponent: float, *masks: Any
+    estimates: Any, truths: Any, cutoff: float, exponent: float
 ) -> tuple[Float[np.ndarray, " s"], int, int]:
     """The distances of the cheapest pairing, in units of the cutoff, at most one; both numbers.
 
@@ -138,9 +131,8 @@ def _paired(
     which the powers of those that compete are numbers that it can add. A distance of the cutoff, or
     one of more than all of these together, costs `most`: how much more makes no difference.
     """
-    of_estimates, of_truths = masks
-    found = _marked("estimate", estimates, of_estimates)
-    there = _marked("truth", truths, of_truths, found.shape[1])
+    found = to_rows(None, "estimates", estimates)
+    there = to_rows(found.shape[1], "truths", truths)
     distances = np.minimum(cdist(found, there) / cutoff, 1.0)
     if np.isnan(distances).any():
         return np.full(min(distances.shape), np.nan), *distances.shape
@@ -152,17 +144,6 @@ def _paired(
         if largest == 0 or (largest / unit) ** exponent >= _FINE:
             return distances[pairs], *distances.shape
         unit = largest
-
-
-def _marked(
-    name: str, points: Any, mask: Any, width: int | None = None
-) -> Float[np.ndarray, "s d"]:
-    """The points of a set that its mask, if there is one, does not leave out."""
-    points = to_rows(width, f"{name}s", points)
-    if mask is None:
-        return points
-    check_shape(f"{len(points)}", **{f"{name}_mask": mask})
-    return points[np.asarray(mask, bool)]
 
 
 @checked

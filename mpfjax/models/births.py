@@ -32,7 +32,7 @@ class AbstractBirth(eqx.Module):
 
     @abc.abstractmethod
     def propose(
-        self, key: Key[Array, ""], measurement: PyTree, num_particles: int, sensor: int = 0
+        self, key: Key[Array, ""], measurement: PyTree, num_particles: int, sensor: int
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """States of new objects that a sensor's measurement may come from, and log b(x) / q(x)."""
 
@@ -101,7 +101,7 @@ class UniformBirth(AbstractBirth, Fitting):
         return self.newborn(key_rest, self.region.sample(key_place, num_particles))
 
     def propose(
-        self, key: Key[Array, ""], measurement: PyTree, num_particles: int, sensor: int = 0
+        self, key: Key[Array, ""], measurement: PyTree, num_particles: int, sensor: int
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """States at places drawn by `locate`."""
         locate = self.locate[sensor] if isinstance(self.locate, tuple) else self.locate

@@ -55,7 +55,7 @@ class AbstractDynamics(Fitting):
         """(d,), or (n, d) where each particle has parameters of its own."""
 
     @abc.abstractmethod
-    def expected(self, current: Rows, previous: Rows | None = None) -> Rows:
+    def expected(self, current: Rows, previous: Rows | None) -> Rows:
         """The place that x_t steps from, given x_{t-1}, and x_{t-2} where the order is 2."""
 
     @abc.abstractmethod
@@ -111,7 +111,7 @@ class RandomWalk(AbstractDynamics):
         """That of `deviations`."""
         return self.deviations.shape
 
-    def expected(self, current: Rows, previous: Rows | None = None) -> Rows:
+    def expected(self, current: Rows, previous: Rows | None) -> Rows:
         """x_{t-1}."""
         return current
 
@@ -214,7 +214,7 @@ class WalkWithVelocity(AbstractDynamics):
         """That of the walk."""
         return self.walk.shape
 
-    def expected(self, current: Rows, previous: Any = None) -> Rows:
+    def expected(self, current: Rows, previous: Any) -> Rows:
         """x_{t-1} + v_{t-1}."""
         return 2 * current - previous
 
@@ -283,7 +283,7 @@ class Autoregression(AbstractDynamics):
         """That of the mean."""
         return self.mean.shape
 
-    def expected(self, current: Rows, previous: Any = None) -> Rows:
+    def expected(self, current: Rows, previous: Any) -> Rows:
         """x̄ + A1 (x_{t-1} - x̄) + A2 (x_{t-2} - x̄)."""
         mean = jnp.broadcast_to(self.mean, current.shape)
         return mean + _times(self.A1, current - mean) + _times(self.A2, previous - mean)

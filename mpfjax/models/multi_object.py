@@ -263,31 +263,28 @@ class PairwiseRepulsion(Fitting):
     """log ψ(x_i, x_j) = -strength · k(|p_i - p_j| / radius), p the positions of two objects.
 
     The pairwise Markov random field of Khan, Balch and Dellaert (2004), for objects that cannot
-    share a place. ψ is symmetric, 1 where the objects are far apart, and smooth: it has a gradient
-    everywhere, even where the objects are at the same point.
+    share a place, with k(r) = (1 - r²)² for r < 1 and 0 beyond. ψ is symmetric, exactly 1 where the
+    objects are further apart than the radius, so that a filter can tell that they do not touch, and
+    smooth: it has a gradient everywhere, even where the objects are at the same point.
 
     - `strength`: -log ψ of two objects at the same point, in nats; positive.
-    - `radius`: in the unit of the positions; positive. With `compact`, k(r) = (1 - r²)² inside the
-      radius and exactly 0 outside it. Without it, k(r) = exp(-r²/2), which is positive everywhere.
+    - `radius`: in the unit of the positions; positive.
     - `features`: maps the states of one object, leading axis n, to (n, k) or (n,); None takes
       the whole state.
 
     Called with the states of two objects, it gives (n,). Raises `ValueError` for a strength or
     radius that is not positive. Use it where look-alikes cross and must not be tracked as one.
-    With the compact form a filter can tell that objects do not touch.
     """
 
     strength: Annotated[Float[Array, ""], POSITIVE] = eqx.field(converter=to_array("strength"))
     radius: Annotated[Float[Array, ""], POSITIVE] = eqx.field(converter=to_array("radius"))
     features: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
-    compact: bool = eqx.field(static=True, default=True)
 
     def __call__(self, states: PyTree, other_states: PyTree) -> Float[Array, " n"]:
         """log ψ of each row of the states with the same row of the other states."""
         gaps = self._positions(states) - self._positions(other_states)
         squares = row_sums((gaps / self.radius.astype(gaps.dtype)) ** 2)
-        nearness = jnp.maximum(1 - squares, 0.0) ** 2 if self.compact else jnp.exp(-squares / 2)
-        return -self.strength.astype(gaps.dtype) * nearness
+        return -self.strength.astype(gaps.dtype) * jnp.maximum(1 - squares, 0.0) ** 2
 
     def _positions(self, states: PyTree) -> Float[Array, "n k"]:
         return flatten_states(states if self.features is None else self.features(states))

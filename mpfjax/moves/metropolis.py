@@ -11,24 +11,24 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, Exponent, InnerShare
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.moves.base import AbstractMarkovMove, Gradient, Step, is_missing
-from mpfjax.moves.propagation.tempered import accepted
 from mpfjax.operations.logarithms import add_gradient, without_gradient
-from mpfjax.operations.matrices import row_sums
-from mpfjax.operations.random import normal, split, uniform
+from mpfjax.operations.random import split, uniform
+from mpfjax.operations.rows import select_rows
+
+# A step of 2% to 100% of the dynamics' standard deviation suits likelihoods from narrow to broad.
+_LEAST_STEP = 0.02
 
 
 class _Target(NamedTuple):
-    """The target of every particle: D(x_t | x_{t-1}) L(y_t | x_t)^β, given its parent."""
+    """The target of every particle: D(x_t | x_{t-1}) L(y_t | x_t), given its parent."""
 
     model: Any
     parents: PyTree
     observation: PyTree
-    exponent: float
 
     def __call__(self, states: PyTree) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """log D and log L, separately: with a large constant in L, their sum loses digits of D."""
@@ -37,35 +37,29 @@ class _Target(NamedTuple):
 
     def ratio(self, new: tuple[Array, Array], old: tuple[Array, Array]) -> Float[Array, " n"]:
         """log π(x') - log π(x)."""
-        return (new[0] - old[0]) + self.exponent * (new[1] - old[1])
+        return (new[0] - old[0]) + (new[1] - old[1])
 
 
 class AbstractMetropolis(AbstractMarkovMove):
     """Steps of Metropolis and Hastings for every particle, given its parent x_{t-1}.
 
     The move of a resample-move filter (Gilks and Berzuini 2001). After x_t was drawn and weighed,
-    and perhaps resampled, each x_t takes `num_moves` steps of a Markov chain that leaves D(x_t |
-    x_{t-1}) L(y_t | x_t)^β invariant. The weights do not change, Ẑ stays unbiased, and offspring of
-    one particle become distinct. Components keep their mass and their particles.
+    and perhaps resampled, each x_t takes a step of a Markov chain that leaves D(x_t | x_{t-1})
+    L(y_t | x_t) invariant. The weights do not change, Ẑ stays unbiased, and offspring of one
+    particle become distinct. Components keep their mass and their particles. For several steps the
+    chain has the move several times.
 
     Nothing is tuned on the particles that move, since that would not be exact. The length of a step
-    is s times the standard deviation of the dynamics, where log s is uniform between log
-    `least_step` and 0 and drawn anew each time. The standard deviation is that of new draws from
-    D(. | x_{t-1}). Integer parts of the state do not move.
+    is s times the standard deviation of the dynamics, where log s is uniform between log 0.02 and 0
+    and drawn anew each time. The standard deviation is that of new draws from D(. | x_{t-1}).
+    Integer parts of the state do not move.
 
-    - `num_moves`: how many steps each particle takes.
-    - `least_step`: the smallest s.
-    - `exponent`: β, for a likelihood that enters by powers, as with `Reweight(exponent)`.
     - `gradient`: "none" differentiates the draws, "stop" the density of the state after the move,
       as with `gradient` of `Propagate`.
 
-    Raises `ValueError` for no steps, a least step or an exponent out of range, and in a filter of a
-    model without `log_transition`.
+    Raises `ValueError` in a filter of a model without `log_transition`.
     """
 
-    num_moves: Count = eqx.field(static=True, default=1)
-    least_step: InnerShare = eqx.field(static=True, default=0.02, kw_only=True)
-    exponent: Exponent = eqx.field(static=True, default=1.0, kw_only=True)
     gradient: Gradient = eqx.field(static=True, default="none", kw_only=True)
 
     needs_parents = True
@@ -89,20 +83,19 @@ class AbstractMetropolis(AbstractMarkovMove):
         if mixture.parents is None:
             who = f"moves: {type(self).__name__}"
             raise ValueError(f"{who} comes before any propagation: there is no x_t yet")
-        target = _Target(now.model, mixture.parents, now.observation, self.exponent)
+        target = _Target(now.model, mixture.parents, now.observation)
         states = mixture.particles
         if self.gradient == "stop":
             states = without_gradient(states)
-        first = densities = target(states)
-        dtype = densities[1].dtype
-        for step_key in split(key, self.num_moves):
-            key_length, key_proposal, key_taken = split(step_key, 3)
-            length = self.least_step ** uniform(key_length, (mixture.num_particles,), dtype)
-            proposed, log_ratio = self.propose(key_proposal, length, states, target)
-            those = target(proposed)
-            log_ratio += target.ratio(those, densities)
-            new, old = (proposed, those), (states, densities)
-            states, densities = accepted(key_taken, log_ratio, new, old)
+        first = target(states)
+        (key_step,) = split(key, 1)
+        key_length, key_proposal, key_taken = split(key_step, 3)
+        length = _LEAST_STEP ** uniform(key_length, (mixture.num_particles,), first[1].dtype)
+        proposed, log_ratio = self.propose(key_proposal, length, states, target)
+        log_ratio += target.ratio(target(proposed), first)
+        # A ratio that is NaN is rejected.
+        is_accepted = jnp.log(uniform(key_taken, log_ratio.shape, log_ratio.dtype)) < log_ratio
+        states = select_rows(is_accepted, proposed, states)
         log_weights = mixture.log_weights
         if self.gradient == "stop":
             states = without_gradient(states)
@@ -131,42 +124,6 @@ class RandomWalkMetropolis(AbstractMetropolis):
         gaps = _gaps(key, target.model, target.parents)
         step = length.astype(rows.dtype)[:, None] * gaps / math.sqrt(2)
         return back(rows + step), jnp.zeros_like(length)
-
-
-class MetropolisAdjustedLangevin(AbstractMetropolis):
-    """Metropolis steps along the gradient: x' = x + s²/2 C ∇ log π(x) + s C^½ ξ, ξ ~ N(0, I).
-
-    MALA (Roberts and Tweedie 1996) for π = D L^β, the gradient by JAX. C is diagonal: the variances
-    of the dynamics, from pairs of fresh draws for all parents. See `AbstractMetropolis`, which has
-    the arguments. Each step takes two draws of the dynamics, two gradients and an evaluation of D
-    and L. Use it in more than a few dimensions, where D and L are smooth.
-    """
-
-    def propose(
-        self, key: Key[Array, ""], length: Float[Array, " n"], states: PyTree, target: _Target
-    ) -> tuple[PyTree, Float[Array, " n"]]:
-        """A step of the Langevin diffusion, and the reverse step's log density relative to it."""
-        rows, back = _as_rows(states)
-        key_spread, key_noise = split(key, 2)
-        gaps = _gaps(key_spread, target.model, target.parents)
-        deviations = jnp.sqrt(0.5 * jnp.mean(gaps**2, axis=0))
-        unit = length.astype(rows.dtype)[:, None] * deviations[None]
-
-        def drift(rows: Float[Array, "n d"]) -> Float[Array, "n d"]:
-            """s/2 C^½ ∇ log π, in the units of the noise."""
-
-            def total(rows: Float[Array, "n d"]) -> Float[Array, ""]:
-                log_dynamics, log_likelihood = target(back(rows))
-                return jnp.sum(log_dynamics) + target.exponent * jnp.sum(log_likelihood)
-
-            return 0.5 * unit * jax.grad(total)(rows)
-
-        noise, forth = normal(key_noise, rows.shape, rows.dtype), drift(rows)
-        proposed = rows + unit * (forth + noise)
-        # The noise of the reverse step, from x' to x.
-        reverse = forth + drift(proposed) + noise
-        log_ratio = row_sums(0.5 * (noise**2 - reverse**2))
-        return back(proposed), log_ratio.astype(length.dtype)
 
 
 def _as_rows(states: PyTree) -> tuple[Float[Array, "n d"], Callable[[Array], PyTree]]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
-from mpfjax.checks import Checked, Count, CountOrZero, check_one_each, checked, saying
+from mpfjax.checks import Checked, CountOrZero, check_one_each, checked, saying
 from mpfjax.filter import Filter, check_keep_parents
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require, with_inputs
@@ -24,6 +24,10 @@ from mpfjax.report import StepInfo
 from mpfjax.running.scan import FilterRun, first_mixture, report_of, run_of, sound, step_or_predict
 from mpfjax.smoothing.backward import draw, draw_exactly, log_kernel_from, walk
 from mpfjax.smoothing.history import NO_PAST
+
+# Particles drawn for each particle's past. With one, few distinct particles of early times are
+# left, as in a genealogy; two are enough (Olsson and Westerborn 2017).
+_DRAWS = 2
 
 
 class SmoothedSums(eqx.Module):
@@ -53,12 +57,11 @@ def smoothed_sums(
     *,
     lag: CountOrZero | None = None,
     method: Literal["exact", "mcmc"] = "exact",
-    num_draws: Count = 2,
 ) -> SmoothedSums:
     """E[Σ_t h(x_{t-1}, x_t) | y], online: PaRIS, in memory that does not grow with t.
 
     Olsson and Westerborn (2017): each particle i of step t carries τ_t^i, the expected sum over the
-    trajectories that end in it. Some particles J of step t - 1 are drawn by the backward kernel,
+    trajectories that end in it. Two particles J of step t - 1 are drawn by the backward kernel,
     W_{t-1}^J D(x_t^i | x_{t-1}^J), and τ_t^i is the mean of τ_{t-1}^J + h(x_{t-1}^J, x_t^i) over
     them. The estimate is Σ_i W_t^i τ_t^i. W are joint weights, so this holds for a mixture too: a
     particle may come from another component. Times Ẑ, it is unbiased if Ẑ is. The filter's run is
@@ -71,8 +74,6 @@ def smoothed_sums(
       with N, but the variance does not grow with t - r. A lag of t or more is one of t - 1.
     - `method`: "exact" weighs all N particles, O(N²) a step. "mcmc" (Dau and Chopin 2023) takes
       the ancestor and goes on by steps of independent Metropolis-Hastings, O(N), and is as exact.
-    - `num_draws`: how many particles J are drawn for each particle. With one, few distinct
-      particles of early times are left, as in a genealogy. Two are enough.
     - `observations`: arrays, or a `Series`.
 
     Raises `ValueError` for a model without `log_transition`, values that are not one a particle,
@@ -84,7 +85,7 @@ def smoothed_sums(
     series = as_series(observations, filter.model)
     if lag is not None:
         lag = min(lag, series.length - 1)
-    smoother = FixedLagSmoother(filter, function, lag or 0, method, num_draws)
+    smoother = FixedLagSmoother(filter, function, lag or 0, method)
     sums = _smooth(key, smoother, series, lag)
     return eqx.tree_at(lambda sums: sums.run, sums, sound(sums.run))
 
@@ -173,7 +174,7 @@ class FixedLagSmoother(Checked):
       `lambda before, now: now` estimates the states themselves, an event its probability.
     - `lag`: L. The longer, the less is lost of what later observations say. More than the dynamics
       remember brings nothing but noise.
-    - `method`, `num_draws`: as for `smoothed_sums`; "mcmc" costs O(N) a step, "exact" O(N²).
+    - `method`: as for `smoothed_sums`; "mcmc" costs O(N) a step, "exact" O(N²).
 
     Raises `ValueError` as `smoothed_sums` does. Use it for estimates that may come a little late,
     as of a place on a map; `smoothed_sums` is for a series that is there as a whole.
@@ -183,7 +184,6 @@ class FixedLagSmoother(Checked):
     function: Callable[[PyTree, PyTree], PyTree]
     lag: CountOrZero = eqx.field(static=True)
     method: Literal["exact", "mcmc"] = eqx.field(static=True, default="exact")
-    num_draws: Count = eqx.field(static=True, default=2)
 
     def __check_init__(self) -> None:
         super().__check_init__()
@@ -246,31 +246,29 @@ class FixedLagSmoother(Checked):
 
         Leaves of the first are (any, n, ...) as they were, of the second (n, ...).
         """
-        model, num_draws = with_inputs(self.filter.model, inputs), self.num_draws
+        model = with_inputs(self.filter.model, inputs)
         anew = jnp.any(moved.began_anew & moved.occupied)
         needed, start = eqx.error_if((moved.occupied, moved.ancestor_indices), anew, NO_PAST)
         if self.method == "exact":
             log_kernel = log_kernel_from(model, mixture)
-            indices = draw_exactly(key, log_kernel, moved.particles, mixture, num_draws, needed)
+            indices = draw_exactly(key, log_kernel, moved.particles, mixture, _DRAWS, needed)
         else:
             key_proposed, key_walk = split(key, 2)
-            # The start counts as a draw, unless it would be the only one.
-            shape = (max(num_draws - 1, 1), start.shape[0])
+            shape = (_DRAWS - 1, start.shape[0])  # the start counts as a draw
             proposed = draw(key_proposed, shape, mixture.log_weights)
             later = walk(key_walk, model, moved.particles, mixture, start, proposed, needed).T
-            both = [start[:, None], later]
-            indices = later if num_draws == 1 else jnp.concatenate(both, axis=1)
+            indices = jnp.concatenate([start[:, None], later], axis=1)
         places = indices.reshape(-1)
         earlier = jax.tree.map(lambda leaf: take(leaf, places), mixture.particles)
-        repeat = partial(jnp.repeat, repeats=num_draws, axis=0)
+        repeat = partial(jnp.repeat, repeats=_DRAWS, axis=0)
         values = self._of_states(earlier, jax.tree.map(repeat, moved.particles))
         no_spread = jax.tree.map(lambda leaf: jnp.zeros_like(jnp.real(leaf)), values)
 
         def of_past(term: Terms) -> Terms:
             drawn = jax.tree.map(partial(take, indices=places), term)
-            return _over_draws(drawn, num_draws)
+            return _over_draws(drawn)
 
-        return jax.vmap(of_past)(terms), _over_draws(Terms(values, no_spread), num_draws)
+        return jax.vmap(of_past)(terms), _over_draws(Terms(values, no_spread))
 
     def _of_states(self, previous: PyTree, states: PyTree) -> PyTree:
         """h of these states; a `ValueError` unless it is one value a particle."""
@@ -280,9 +278,9 @@ class FixedLagSmoother(Checked):
         return jax.tree.map(as_inexact, values)
 
 
-def _over_draws(terms: Terms, num_draws: int) -> Terms:
+def _over_draws(terms: Terms) -> Terms:
     """The moments over each particle's draws, which stand side by side."""
-    draws = jax.tree.map(lambda leaf: leaf.reshape(-1, num_draws, *leaf.shape[1:]), terms)
+    draws = jax.tree.map(lambda leaf: leaf.reshape(-1, _DRAWS, *leaf.shape[1:]), terms)
     means, within = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=1), draws)
 
     def both(draws: Array, mean: Array, within: Array) -> Array:

@@ -176,11 +176,9 @@ class TestPairwiseRepulsion:
 
     def test_values(self):
         here = jnp.zeros((4, 2))
-        compact = PairwiseRepulsion(2.0, 10.0)(here, self.PLACES)
-        np.testing.assert_allclose(compact, [-2, -2 * 0.99**2, -2 * 0.75**2, 0.0], rtol=1e-5)
-        assert float(compact[3]) == 0.0
-        smooth = PairwiseRepulsion(2.0, 5.0, compact=False)(self.PLACES, here)
-        np.testing.assert_allclose(smooth, -2 * np.exp([0, -1 / 50, -0.5, -50]), rtol=1e-5)
+        found = PairwiseRepulsion(2.0, 10.0)(here, self.PLACES)
+        np.testing.assert_allclose(found, [-2, -2 * 0.99**2, -2 * 0.75**2, 0.0], rtol=1e-5)
+        assert float(found[3]) == 0.0
 
     def test_sees_the_positions_that_it_is_given(self):
         first = PairwiseRepulsion(1.0, 4.0, features=lambda states: states["box"][:, 0])
@@ -191,8 +189,7 @@ class TestPairwiseRepulsion:
             first(states, other), -(np.maximum(1 - squares, 0) ** 2), rtol=1e-5
         )
 
-    @pytest.mark.parametrize("compact", [True, False])
-    def test_has_a_gradient_on_the_same_spot(self, compact):
-        repulsion = PairwiseRepulsion(2.0, 1.0, compact=compact)
+    def test_has_a_gradient_on_the_same_spot(self):
+        repulsion = PairwiseRepulsion(2.0, 1.0)
         slope = jax.grad(lambda x: repulsion(x, jnp.zeros((1, 2))).sum())(jnp.zeros((1, 2)))
         np.testing.assert_array_equal(slope, 0.0)

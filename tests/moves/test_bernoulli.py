@@ -446,7 +446,7 @@ def test_new_objects_are_even_in_a_region(region):
     def near(places):
         return jnp.exp(-jnp.sum((places - z[None]) ** 2, 1) / 0.18)
 
-    proposed, log_weights = birth.propose(KEY, z, 20_000)
+    proposed, log_weights = birth.propose(KEY, z, 20_000, 0)
     expected = np.asarray(near(states))
     found = np.asarray(near(proposed) * jnp.exp(log_weights))
     error = np.hypot(expected.std(), found.std()) / np.sqrt(20_000)

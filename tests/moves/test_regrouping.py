@@ -210,14 +210,16 @@ class TestSplit:
 
 class TestPoolAndRandomPartition:
     MIXTURE = clouds([[0, 0], [5, 5]], [10, 13])
+    PAIR = MIXTURE.replace(num_components=2)
+    SIZES = (4, 4, 4, 4, 4, 3)
 
     def test_pool_puts_everything_into_one_component(self):
         assert (labels_after(Pool(), self.MIXTURE) == 0).all()
 
-    @pytest.mark.parametrize(("num_sets", "sizes"), [(None, [4, 4, 4, 4, 4, 3]), (2, [12, 11])])
-    def test_sets_are_of_equal_size_and_without_replacement(self, num_sets, sizes):
-        labels = labels_after(RandomPartition(num_sets), self.MIXTURE)
-        assert np.bincount(labels).tolist() == sizes
+    @pytest.mark.parametrize(("mixture", "sizes"), [(MIXTURE, SIZES), (PAIR, [12, 11])])
+    def test_sets_are_of_equal_size_and_without_replacement(self, mixture, sizes):
+        labels = labels_after(RandomPartition(), mixture)
+        assert np.bincount(labels).tolist() == [*sizes]
 
     def test_filled_slots_are_dealt_before_empty_ones(self):
         log_weights = np.where(np.arange(30) % 3 == 0, 0.0, -np.inf)
@@ -226,8 +228,8 @@ class TestPoolAndRandomPartition:
         assert np.bincount(labels[::3]).tolist() == [2] * 5
 
     def test_every_particle_comes_into_every_set_equally_often(self):
-        move = RandomPartition(2)
-        draw = jax.jit(jax.vmap(lambda key: move(key, self.MIXTURE).component_indicators))
+        move = RandomPartition()
+        draw = jax.jit(jax.vmap(lambda key: move(key, self.PAIR).component_indicators))
         labels = np.asarray(draw(jax.random.split(KEY, 4000)))
         assert np.abs(labels.mean(axis=0) - 11 / 23).max() < 4.5 * 0.5 / np.sqrt(4000)
         together = np.mean(labels[:, :1] == labels[:, 1:], axis=0)

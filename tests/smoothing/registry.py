@@ -114,9 +114,9 @@ SMOOTHERS = {
     "backward sampling": Smoother(of_run=_backward()),
     "backward sampling, MCMC": Smoother(of_run=_backward(method="mcmc", num_moves=8)),
     "PaRIS": Smoother(online=_online(), summed=True),
-    "PaRIS, MCMC": Smoother(online=_online(method="mcmc", num_draws=3), summed=True),
+    "PaRIS, MCMC": Smoother(online=_online(method="mcmc"), summed=True),
     "fixed lag": Smoother(online=_online(lag=LAG), lag=LAG),
-    "fixed lag, MCMC": Smoother(online=_online(lag=LAG, method="mcmc", num_draws=3), lag=LAG),
+    "fixed lag, MCMC": Smoother(online=_online(lag=LAG, method="mcmc"), lag=LAG),
     "fixed lag, step by step": Smoother(online=_stepwise, lag=LAG),
     "conditional filter": Smoother(kernel=_conditional),
 }

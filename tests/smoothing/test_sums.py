@@ -69,7 +69,7 @@ def test_variances_are_about_the_mean_however_far_from_zero(method):
     found = [
         smoothed_sums(
             jax.random.key(0), mpfjax.particle_filter(model, 300), seen + place,
-            lambda before, after: {"x": after, "xx": after**2}, lag=12, method=method, num_draws=4,
+            lambda before, after: {"x": after, "xx": after**2}, lag=12, method=method,
         )
         for model, place in ((near, 0.0), (far, 20.0))
     ]  # fmt: skip

@@ -51,7 +51,6 @@ WITH_GAP = ONE.at[1].set(jnp.nan)
 # A filter, before its gradient is chosen, and the observations.
 FILTERS = {
     "mpf": (single(mpfjax.mixture_particle_filter, 2, ess_threshold=0.7), ONE),
-    "langevin": (own(Propagate(), RESAMPLE, mpfjax.MetropolisAdjustedLangevin()), ONE),
     "pf": (single(mpfjax.particle_filter), ONE),
     "mpf rqmc": (single(mpfjax.mixture_particle_filter, 2, noise="rqmc"), ONE),
     "guided pf": (guided, ONE),
@@ -61,7 +60,7 @@ FILTERS = {
     "ps": (joint(mpfjax.partitioned_sampling, order=(1, 0)), TWO),
     "dps": (
         joint(
-            mpfjax.distributed_partitioned_sampling, reassembly="evidence", ess_threshold=0.7
+            mpfjax.distributed_partitioned_sampling, reassembly="evidence"
         ), TWO,
     ),
 }  # fmt: skip

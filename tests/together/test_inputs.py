@@ -183,7 +183,7 @@ def test_smoothed_means_are_those_of_the_joint_normal(method):
             return jnp.stack([before, after], axis=1)
 
         series = mpfjax.Series(OBSERVATIONS, given)
-        found = smoothed_sums(key, filter, series, pair, lag=LENGTH, method="exact", num_draws=2)
+        found = smoothed_sums(key, filter, series, pair, lag=LENGTH, method="exact")
         return jnp.concatenate([found.terms[:1, 0], found.terms[:, 1]])
 
     one = by_sums if method == "sums" else by_trajectories
@@ -227,7 +227,6 @@ EVERYWHERE = {
         Driven(inputs=inputs), 32, LookAhead()
     ),
     "families": own_chain(mpfjax.PropagateNested(mpfjax.Propagate(), 2)),
-    "stages": own_chain(mpfjax.PropagateTempered()),
     "a proposal": own_chain(mpfjax.Propagate(mpfjax.GaussNewtonProposal())),
     "ps": of_objects(lambda joint: mpfjax.partitioned_sampling(joint, 32)),
     "clusters": of_objects(

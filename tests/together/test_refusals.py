@@ -91,8 +91,8 @@ TARGETS = {
 GOOD = {
     **alike({}, mpfjax.QuadraticModel, KMeans, mpfjax.Split, mpfjax.Prune, IslandInteraction,
             Propagate, Predict, Reweight, mpfjax.GaussNewtonProposal, mpfjax.RandomWalkMetropolis,
-            mpfjax.MetropolisAdjustedLangevin, mpfjax.RegimeProposal, mpfjax.PropagateMarginalised,
-            mpfjax.PropagateRegimes, mpfjax.Partitioned, PropagateIndependently,
+            mpfjax.RegimeProposal, mpfjax.PropagateMarginalised, mpfjax.PropagateRegimes,
+            mpfjax.Partitioned, mpfjax.RandomPartition, PropagateIndependently,
             PropagateInClusters),
     **alike({"particles_per_component": 2}, Resample, mpfjax.GaussianRegeneration),
     **alike({"filter": FILTER}, mpfjax.with_lookahead, mpfjax.with_point_sets,
@@ -128,11 +128,9 @@ GOOD = {
     mpfjax.per_particle: {"model": DriftOfOne()},
     mpfjax.AuxiliaryResample: {"resample": Resample(), "lookahead": GUIDE},
     mpfjax.Merge: {"max_distance": 2.0},
-    mpfjax.RandomPartition: {"num_sets": 2},
     mpfjax.GroupBy: {"group": nothing},
     mpfjax.Every: {"every": 2, "moves": [KMeans(1)]},
     mpfjax.PropagateNested: {"propagate": Propagate(), "num_draws": 2},
-    mpfjax.PropagateTempered: {"resample": Resample(), "exponents": (0.1, 1.0)},
     SelectInitial: {"num_draws": 2},
     mpfjax.Replay: {"filter": FILTER, "lag": 2},
     mpfjax.with_eve_indices: {
@@ -404,7 +402,6 @@ REFUSED = (
     ("high: 1.0 is not above low", lambda: mpfjax.QuadraticModel(low=1.0, high=1.0)),
     (r"observations: shape \(2,\) is not \(t, 1\)",
      lambda: exact.kalman_filter(mpfjax.LinearGaussianModel(**LINEAR), TWO)),
-    ("log_initial: shape", lambda: exact.grid_filter(MODEL, TWO, np.linspace(-1, 1, 9), TWO)),
     # scores
     ("weights: shape", lambda: metrics.crps(np.ones((2, 3)), np.ones((2, 4)), TWO)),
     (r"observations: shape \(3,\) is not \(2\)",
@@ -450,21 +447,17 @@ REFUSED = (
     *(
         (f"a model, and {kind.__name__} holds none; the filter has its own",
          lambda kind=kind: kind(MODEL))
-        for kind in (Propagate, Reweight, mpfjax.PropagateMarginalised, mpfjax.PropagateTempered,
-                     mpfjax.RandomWalkMetropolis, mpfjax.Partitioned, mpfjax.GaussNewtonProposal,
-                     SelectInitial)
+        for kind in (Propagate, mpfjax.PropagateMarginalised, mpfjax.Partitioned,
+                     mpfjax.GaussNewtonProposal, SelectInitial)
     ),
     ("sort_by: 9 coordinates", lambda: run_of(
         changed(Drift, sample_initial=lambda self, key, n: jnp.zeros((n, 9))), noise="rqmc")),
     ("propagate: gradient 'stop'",
      lambda: mpfjax.PropagateNested(Propagate(gradient="stop"))),
-    ("exponents: .* that rise", lambda: mpfjax.PropagateTempered(exponents=(0.1, 0.5))),
-    ("resample: sort_by", lambda: mpfjax.PropagateTempered(Resample(sort_by="hilbert"))),
     ("comes before any propagation: there is no x_t yet",
      lambda: run(Filter(MODEL, [mpfjax.RandomWalkMetropolis(), Propagate()], 4))),
     ("IslandInteraction leaves no particle one parent", lambda: Filter(MODEL, [Propagate(),
         mpfjax.Every(2, [IslandInteraction()]), mpfjax.RandomWalkMetropolis()], 4)),
-    ("model: .* is conditionally linear", lambda: Filter(SWITCHING, [Predict(), Reweight(0.5)], 4)),
     ("object_model: .* is conditionally linear",
      lambda: mpfjax.ClutteredModel(SWITCHING, 0.9, 0.1)),
     ("orders: ", lambda: mpfjax.partitioned_sampling(JOINT, 10, (0, 0))),

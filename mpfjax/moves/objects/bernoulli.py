@@ -1,13 +1,13 @@
 """Objects that come and go: a component for each, by the probabilities of all associations."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
-from mpfjax.checks import Count, Share, check
+from mpfjax.checks import Count, check
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
 from mpfjax.models.clutter import filled, measured
 from mpfjax.models.targets import TargetsModel
@@ -20,6 +20,7 @@ from mpfjax.operations.random import split, uniform
 from mpfjax.operations.stored import take
 
 TARGETS = "targets"
+_LEAST_EXISTENCE = 1e-4  # of an object with a component: one less probable needs no particles
 _SAME = 2.0  # pooled deviations within which two components may describe one object
 
 
@@ -67,7 +68,7 @@ class Associate(AbstractWrapper):
     3. Each u becomes u (1 - p_D) P(m has none) / P₀ + Σ_j u G_j P(m has j) / Σ_m u G_j, with the
        probabilities of `associate`, and u (1 - p_D) in component 0.
     4. The M most probable objects stay, the first in component 1. Others, and those below
-       `least_existence`, go to component 0 and are no longer told apart, so that none is lost
+       1e-4, go to component 0 and are no longer told apart, so that none is lost
        (Williams 2012).
     5. Each component is resampled, by `resample`, and component 0 systematically.
 
@@ -80,7 +81,6 @@ class Associate(AbstractWrapper):
 
     - `particles_per_birth`: the particles of a new object at each measurement.
     - `undetected_particles`: those of component 0, which fill the first slots.
-    - `least_existence`: an object less probable than this has no component of its own.
     - `resample`: how each object is drawn anew, with the particles that its weight earns.
 
     Raises `ValueError` on islands, for `slots`, and without slots for the objects.
@@ -88,7 +88,6 @@ class Associate(AbstractWrapper):
 
     particles_per_birth: Count = eqx.field(static=True, default=50, kw_only=True)
     undetected_particles: Count = eqx.field(static=True, default=400, kw_only=True)
-    least_existence: Share = eqx.field(static=True, default=1e-4, kw_only=True)
     resample: AbstractResampling = eqx.field(default=Resample(), kw_only=True)
 
     holds = ("resample",)
@@ -123,7 +122,7 @@ class Associate(AbstractWrapper):
         """Weigh by each sensor's measurements in turn, then resample."""
         if mixture.usable_slots is not None or num_islands() > 1:
             raise ValueError("slots: Associate fills every slot, and is not for islands")
-        model: Any = now.model
+        model = now.model
         scans = () if now.observation is None else model.scans(now.observation)
         key_new, key_last, *keys = split(key, 2 + len(scans))
         intensity = self._predicted(key_new, mixture, model)
@@ -232,7 +231,7 @@ class Associate(AbstractWrapper):
         """The component of each particle: the most probable objects have one. And the memory."""
         existence = jax.lax.stop_gradient(intensity.sums(intensity.masses))
         order = jnp.argsort(-existence)
-        is_probable = existence[order] >= self.least_existence
+        is_probable = existence[order] >= _LEAST_EXISTENCE
         ranks = jnp.arange(len(order), dtype=jnp.int32)
         components = jnp.where(is_probable & (ranks < most), ranks + 1, 0)
         of_each = intensity.of_owners(jnp.zeros_like(components).at[order].set(components))

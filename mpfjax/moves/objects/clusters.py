@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, no_ancestors
 from mpfjax.models.base import require
 from mpfjax.moves.base import Step, is_missing
@@ -65,10 +64,7 @@ class PropagateInClusters(AbstractPropagationByObject):
 
     - `start`: every object "apart", or all "together" in one cluster, as for an x_0 under which
       the objects are not independent.
-    - `split_after`: None never splits a cluster, which is exact. With a number s, objects that had
-      no contact for s steps, directly or through others, go into separate clusters. The filter
-      goes on with the product of their marginals: an approximation (`approximate` is true).
-    - `scheme`: of resampling, as in `Resample`.
+    A cluster never splits, since its objects are not independent any more.
 
     Cost: J x N likelihoods a step, J(J-1) N² / 2 potentials to find contact, and 2 N² J
     transition densities and J² N² potentials where there is a cluster of several.
@@ -82,24 +78,18 @@ class PropagateInClusters(AbstractPropagationByObject):
     taken from the previous states.
 
     Raises `ValueError` for a mixture of several components, a model of one object, a model
-    without `log_transition` where it is needed, and an unknown `start` or scheme, or
-    `split_after` below 1.
+    without `log_transition` where it is needed, and an unknown `start`.
     """
 
     start: Literal["apart", "together"] = eqx.field(static=True, default="apart")
-    split_after: Count | None = eqx.field(static=True, default=None)
+
+    approximate = False
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model of one object, or without the density it needs."""
         super().check(now, num_particles, num_components)
-        model: Any = now.model
-        if self._may_be_joint(model):
-            require(model.object_model, "log_transition", "PropagateInClusters")
-
-    @property
-    def approximate(self) -> bool:
-        """Whether clusters are split again."""
-        return self.split_after is not None
+        if self._may_be_joint(now.model):
+            require(now.model.object_model, "log_transition", "PropagateInClusters")
 
     def _may_be_joint(self, model: Any) -> bool:
         """Whether there can ever be a cluster of several objects."""
@@ -107,20 +97,17 @@ class PropagateInClusters(AbstractPropagationByObject):
         return joins and model.num_objects > 1
 
     def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
-        """The clusters' labels, and the steps since the last contact of each two objects."""
-        num_objects = now.model.num_objects
-        labels = jnp.arange(num_objects, dtype=jnp.int32)
-        if self.start == "together":
-            labels = jnp.zeros_like(labels)
-        steps_apart = jnp.zeros((num_objects, num_objects), jnp.int32)
-        return {"clusters": {"labels": labels, "steps_apart": steps_apart}}
+        """The clusters' labels."""
+        labels = jnp.arange(now.model.num_objects, dtype=jnp.int32)
+        labels = jnp.zeros_like(labels) if self.start == "together" else labels
+        return {"clusters": {"labels": labels}}
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Merge the clusters that meet, then advance the filter of every cluster by one step.
 
         Where y_t is missing, all objects are predicted, and clusters stay.
         """
-        model: Any = now.model
+        model = now.model
         if is_missing(now):
             return predict(key, model, mixture, "none")
         require_equal_rows(mixture, "PropagateInClusters")
@@ -129,27 +116,27 @@ class PropagateInClusters(AbstractPropagationByObject):
         keys = split(key, 2 * num_objects + 2)
         keys_objects, keys_rows = keys[:num_objects], keys[num_objects : 2 * num_objects]
         key_inside, key_shift = keys[2 * num_objects :]
-        particles, memory = mixture.particles, mixture.memory["clusters"]
+        particles, labels = mixture.particles, mixture.memory["clusters"]["labels"]
         points, log_likelihoods = moved_objects(model, keys_objects, particles, now.observation)
         common = jax.vmap(finite_max)(log_likelihoods)
         log_likelihoods = log_likelihoods - common[:, None]
         if self._may_be_joint(model):
-            memory = self._regrouped(model, points, memory)
+            labels = lowest_connected(together(labels) | coupled(model, points, labels))
             particles, log_growth = self._updated(
-                model, (keys_rows, key_inside), particles, points, log_likelihoods, memory["labels"]
+                model, (keys_rows, key_inside), particles, points, log_likelihoods, labels
             )
         else:
-            rows, log_growth = self._resampled(keys_rows, memory["labels"], log_likelihoods)
+            rows, log_growth = self._resampled(keys_rows, labels, log_likelihoods)
             particles = rows_of_each(points, rows)
         # Row i is then a draw of the product of the clusters: any row of one cluster meets any row
         # of another with the same probability.
-        keys_shift = take(split(key_shift, num_objects), memory["labels"])
+        keys_shift = take(split(key_shift, num_objects), labels)
         places = jnp.arange(mixture.num_particles, dtype=jnp.int32)
         particles = rows_of_each(particles, jax.vmap(rotated, (0, None))(keys_shift, places))
         moved = mixture.replace(
             particles=particles,
             ancestor_indices=no_ancestors(mixture),
-            memory=mixture.memory | {"clusters": memory},
+            memory=mixture.memory | {"clusters": {"labels": labels}},
         ).weighed(log_growth[None], jnp.sum(common)[None])
 
         def impossible() -> ParticleMixture:
@@ -193,15 +180,6 @@ class PropagateInClusters(AbstractPropagationByObject):
         particles, log_gain = jax.lax.cond(jnp.all(alone), stay, cross)
         return particles, log_growth + log_gain
 
-    def _regrouped(self, model: Any, points: PyTree, memory: dict[str, Array]) -> dict[str, Array]:
-        """The clusters of the objects whose predicted points are given."""
-        meets = coupled(model, points, memory["labels"], self.split_after is not None)
-        links, steps_apart = together(memory["labels"]), memory["steps_apart"]
-        if self.split_after is not None:
-            steps_apart = jnp.where(meets, 0, steps_apart + 1)
-            links = links & (steps_apart < self.split_after)
-        return {"labels": lowest_connected(links | meets), "steps_apart": steps_apart}
-
     def _resampled(
         self,
         keys: Key[Array, " objects"],
@@ -209,6 +187,6 @@ class PropagateInClusters(AbstractPropagationByObject):
         log_weights: Float[Array, "objects n"],
     ) -> tuple[Int[Array, "objects n"], Float[Array, ""]]:
         """Each object's rows drawn anew, alike in a cluster, and log Π of the mean weights."""
-        rows, log_growths = drawn_rows(self.scheme, take(keys, labels), log_weights)
+        rows, log_growths = drawn_rows(take(keys, labels), log_weights)
         is_first = labels == jnp.arange(len(labels), dtype=labels.dtype)
         return rows, jnp.sum(jnp.where(is_first, log_growths, 0.0))

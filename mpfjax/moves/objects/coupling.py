@@ -24,11 +24,11 @@ _GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 def coupled(
-    model: MultiObjectModel, points: PyTree, labels: Int[Array, " objects"], may_split: bool
+    model: MultiObjectModel, points: PyTree, labels: Int[Array, " objects"]
 ) -> Bool[Array, "objects objects"]:
     """Which objects have points between which ψ ≠ 1, over all pairs of their points.
 
-    It is not computed within a cluster that can never split.
+    It is not computed within a cluster, which never splits.
     """
     num_objects, interaction = model.num_objects, model.interaction
     if interaction is None:
@@ -43,8 +43,6 @@ def coupled(
             log_psi = over_pairs(*(model.object_states(points, k) for k in pair))
             return jnp.any(log_psi != 0)
 
-        if may_split:
-            return carry, look()
         return carry, jax.lax.cond(labels[i] == labels[j], lambda: jnp.zeros((), bool), look)
 
     pairs = (jnp.asarray(first, jnp.int32), jnp.asarray(second, jnp.int32))

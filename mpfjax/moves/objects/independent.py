@@ -1,7 +1,5 @@
 """Independent objects: a small particle filter for each, in one mixture."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,7 +12,7 @@ from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.moves.base import AbstractPropagation, Step, is_missing
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.allocation import require_equal_rows
-from mpfjax.moves.resampling.resample import Resample, Scheme
+from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
@@ -22,8 +20,6 @@ from mpfjax.operations.stored import take
 
 class AbstractPropagationByObject(AbstractPropagation):
     """A propagation in which every object of a particle has a parent of its own."""
-
-    scheme: Scheme = eqx.field(static=True, default="systematic", kw_only=True)
 
     keeps_parents = False
     biases_score = True
@@ -44,8 +40,8 @@ class PropagateIndependently(AbstractPropagationByObject):
 
     The move needs particles of equal weight, as x_0 has and as it returns them; the chain needs no
     other resampling. It refuses a model with an interaction, unless `ignores_interaction`, which is
-    `approximate`. Raises `ValueError` for a mixture of several components, a model of one object,
-    and an unknown scheme.
+    `approximate`. Raises `ValueError` for a mixture of several components, and a model of one
+    object.
     """
 
     ignores_interaction: bool = eqx.field(static=True, default=False, kw_only=True)
@@ -64,7 +60,7 @@ class PropagateIndependently(AbstractPropagationByObject):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """One step of every object's filter; where y_t is missing, a prediction."""
-        model: Any = now.model
+        model = now.model
         if is_missing(now):
             return predict(key, model, mixture, "none")
         require_equal_rows(mixture, "PropagateIndependently")
@@ -74,7 +70,7 @@ class PropagateIndependently(AbstractPropagationByObject):
         points, log_likelihoods = moved_objects(
             model, keys[:num_objects], mixture.particles, now.observation
         )
-        rows, log_growths = drawn_rows(self.scheme, keys[num_objects:], log_likelihoods)
+        rows, log_growths = drawn_rows(keys[num_objects:], log_likelihoods)
         # An object whose particles all have zero likelihood moves by its dynamics alone.
         own = jnp.arange(rows.shape[1], dtype=rows.dtype)[None]
         rows = jnp.where((log_growths > -jnp.inf)[:, None], rows, own)
@@ -99,10 +95,10 @@ def moved_objects(
 
 
 def drawn_rows(
-    scheme: str, keys: Key[Array, " objects"], log_weights: Float[Array, "objects n"]
+    keys: Key[Array, " objects"], log_weights: Float[Array, "objects n"]
 ) -> tuple[Int[Array, "objects n"], Float[Array, " objects"]]:
     """The rows that each object is resampled from, and log of its mean weight."""
-    resample = Resample(scheme)
+    resample = Resample()
 
     def draw(key: Key[Array, ""], log_weights: Float[Array, " n"]) -> tuple:
         cloud = single_component(log_weights).weighed(log_weights)

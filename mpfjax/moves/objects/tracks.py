@@ -8,9 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from mpfjax.checks import Share, checked, warn
+from mpfjax.checks import checked, warn
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.moves.objects.bernoulli import TARGETS
+
+# A track is told where its object is more probable than not.
+_LEAST_EXISTENCE = 0.5
 
 
 class Targets(NamedTuple):
@@ -87,21 +90,20 @@ def number_distribution(existence: Float[Array, " m"]) -> Float[Array, " n"]:
 
 
 @checked
-def track_table(run: Targets, least_existence: Share = 0.5) -> dict[str, np.ndarray]:
+def track_table(run: Targets) -> dict[str, np.ndarray]:
     """The tracks of a run as columns: `pandas.DataFrame(track_table(run.collected))`.
 
     - `run`: what `run_filter(..., collect=targets)` collected, with a leading axis of steps.
-    - `least_existence`: a track is told in steps in which its object is at least this probable.
-
+    A track has a row for each step in which its object exists with a probability of a half or more.
     The columns are `step`, from 1 on, `label`, `existence`, and `mean_k` and `deviation_k` of each
     number of the state. Warns where objects were crowded out, with the first such step.
     """
     lost = np.asarray(run.crowded_out)
-    if len(steps := np.flatnonzero(lost >= least_existence)):
+    if len(steps := np.flatnonzero(lost >= _LEAST_EXISTENCE)):
         at = f"at step {steps[0] + 1} for {lost[steps[0]]:.1f} objects"
         warn(f"max_targets: there was no room {at}; they are not told apart")
     existence, labels = np.asarray(run.existence), np.asarray(run.labels)
-    steps, places = np.nonzero((existence >= least_existence) & (labels > 0))
+    steps, places = np.nonzero((existence >= _LEAST_EXISTENCE) & (labels > 0))
     flat = jax.vmap(flatten_states)(run.means)
     means = np.asarray(flat)[steps, places]
     variances = np.diagonal(np.asarray(run.covariances), axis1=2, axis2=3)[steps, places]

@@ -6,10 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Exponent
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_moved, require, require_noise
-from mpfjax.models.law import law_of, refuse_marginalised
+from mpfjax.models.law import law_of
 from mpfjax.models.noise import Noise, draw_noise, noise_dtype
 from mpfjax.moves.base import (
     AbstractPropagation,
@@ -19,7 +18,7 @@ from mpfjax.moves.base import (
     Step,
     is_missing,
 )
-from mpfjax.operations.logarithms import add_gradient, finite_max, without_gradient
+from mpfjax.operations.logarithms import add_gradient, without_gradient
 
 
 class Draw(AbstractPropagation):
@@ -124,17 +123,8 @@ class Predict(Draw):
 class Reweight(AbstractPropagation):
     """Multiply the weights by L(y_t | x_t): the second half of a bootstrap `Propagate`.
 
-    `exponent` is β where the factor is L^β: the likelihood enters by powers, with other moves
-    between them. The exponents of a chain's `Reweight` add up to 1. Raises `ValueError` for one not
-    in (0, 1]. Use it after `Predict` and what a chain does to the prediction.
+    Use it after `Predict` and what a chain does to the prediction.
     """
-
-    exponent: Exponent = eqx.field(static=True, default=1.0)
-
-    def check(self, now: Step, num_particles: int, num_components: int) -> None:
-        """Raise a `ValueError` for a part of a marginalised likelihood."""
-        if self.exponent != 1:
-            refuse_marginalised(now.model, "a part of the likelihood", "take exponent 1")
 
     def around(self, reference: Any) -> "Reweight":
         """The move itself, which weighs the trajectory as any other."""
@@ -144,13 +134,8 @@ class Reweight(AbstractPropagation):
         """Reweight every particle by y_t, unless it is missing."""
         if is_missing(now):
             return mixture
-        if self.exponent == 1:
-            states, log_factors = now.law.see(now.observation, mixture.particles)
-            return mixture.replace(particles=states).weighed(*log_factors)
-        log_factors = now.law.log_likelihood(now.observation, mixture.particles)
-        # Differences would be lost to rounding beside a large common constant.
-        common = finite_max(jnp.where(mixture.occupied, log_factors, -jnp.inf))
-        return mixture.weighed(self.exponent * (log_factors - common), self.exponent * common[None])
+        states, log_factors = now.law.see(now.observation, mixture.particles)
+        return mixture.replace(particles=states).weighed(*log_factors)
 
 
 def noise_of_slots(

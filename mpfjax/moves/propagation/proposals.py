@@ -67,6 +67,10 @@ class _GaussianProposal(AbstractProposal):
         return law.log_density(law.back(states.reshape(law.means.shape) - law.means))
 
 
+# Width and depth of the network that `create` makes: enough to turn y_t into a shift.
+_HIDDEN = 16, 2
+
+
 class NetworkProposal(_GaussianProposal):
     """A Gaussian whose mean and deviations a network gives, from x_{t-1} and y_t.
 
@@ -96,13 +100,10 @@ class NetworkProposal(_GaussianProposal):
         state_size: Count,
         observation_size: Count,
         scale: float | Float[Array, " d"],
-        *,
-        width: Count = 16,
-        depth: Count = 2,
     ) -> "NetworkProposal":
         """An untrained one: a small network, whose draws are about N(x_{t-1}, scale²)."""
         sizes = (state_size + observation_size, 2 * state_size)
-        network = eqx.nn.MLP(*sizes, width, depth, jax.nn.tanh, key=key)
+        network = eqx.nn.MLP(*sizes, *_HIDDEN, jax.nn.tanh, key=key)
         last = jax.tree.map(lambda leaf: 0.1 * leaf, network.layers[-1])
         return cls(eqx.tree_at(lambda net: net.layers[-1], network, last), scale)
 
@@ -130,8 +131,7 @@ class GaussNewtonProposal(_GaussianProposal):
     mean of the resulting Gaussian, whose precision is Λ = Q⁻¹ + Hᵀ R⁻¹ H (Doucet, Godsill and
     Andrieu 2000, section II.D, local linearisation). The draw is from N(mean, inflation² Λ⁻¹). An
     inflation above one keeps the weights bounded if the Gaussian is narrower than the target. It
-    costs no exactness, as weights correct for it; the default of `GaussianRegeneration`, where
-    nothing does, is 1.
+    costs no exactness, as weights correct for it.
 
     The model has `transition_mean`, `observation_mean`, `transition_covariance`, (d, d), and
     `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.

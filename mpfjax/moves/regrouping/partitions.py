@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import Count, saying, shown
+from mpfjax.checks import saying, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping, Regrouped, Step, is_missing
 from mpfjax.operations.prefix_sums import count_upto
@@ -35,20 +35,13 @@ class RandomPartition(AbstractRegrouping):
     does not divide N. Empty slots are dealt after the filled ones. The mass of a set is that of
     its particles (eq. 5), so the distribution does not change.
 
-    - `num_sets`: C; None takes as many as the mixture has components.
-
-    Raises `ValueError` for C < 1, or more sets than components. Use it where all components
-    should stand for the same distribution, as when `Partitioned` gives each an order of its own.
+    C is the number of components. Use it where all components should stand for the same
+    distribution, as when `Partitioned` gives each an order of its own.
     """
-
-    num_sets: Count | None = eqx.field(static=True, default=None)
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """A random set for every particle."""
-        n = mixture.num_particles
-        num_sets = mixture.num_components if self.num_sets is None else self.num_sets
-        if num_sets > (most := mixture.num_components):
-            raise ValueError(f"num_sets: {num_sets} is more than num_components, {most}")
+        n, num_sets = mixture.num_particles, mixture.num_components
         # Sets are dealt in turn and then sorted into a random order. Each is a word: the set in the
         # lowest bits, random bits above it. Words of empty slots come after all others.
         width = (num_sets - 1).bit_length()

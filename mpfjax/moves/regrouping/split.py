@@ -22,6 +22,9 @@ from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.segments import segment_argmax, spread
 from mpfjax.operations.stored import VECTOR, cond_if_any, stored, take
 
+# 2-means starts at the two ends, and needs few iterations.
+_ITERATIONS = 3
+
 
 class Split(AbstractRegrouping, ByFeatures):
     """Split a component in two where it has become too diffuse.
@@ -47,7 +50,6 @@ class Split(AbstractRegrouping, ByFeatures):
     min_deviations: NotNegative = eqx.field(static=True, default=4.0)
     min_distance: NotNegative = eqx.field(static=True, default=0.0, kw_only=True)
     min_share: Annotated[float, share(0.5)] = eqx.field(static=True, default=0.05, kw_only=True)
-    num_iterations: Count = eqx.field(static=True, default=3, kw_only=True)
     sample_size: Count | None = eqx.field(static=True, default=32, kw_only=True)
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
@@ -84,7 +86,7 @@ class Split(AbstractRegrouping, ByFeatures):
         sample = particles
         if size is not None and mixture.num_particles > size * m:
             sample = _sampled(particles, size * m, mixture)
-        centres = _two_means(sample, m, self.num_iterations)
+        centres = _two_means(sample, m)
         side, gaps = _nearer(features, centres, parent)
         halves = summarise_about(centres, gaps, weights, parent + m * side)
         masses = halves.masses.reshape(2, m)
@@ -126,7 +128,7 @@ def _sampled(particles: _Particles, most: int, mixture: ParticleMixture) -> _Par
     )
 
 
-def _two_means(sample: _Particles, m: int, num_iterations: int) -> Float[Array, "g k"]:
+def _two_means(sample: _Particles, m: int) -> Float[Array, "g k"]:
     """The centres of two halves of each component, by weighted 2-means from its two ends."""
     features, weights, parent, _ = sample
     _, means = weighted_means(features, weights, parent, m)
@@ -138,7 +140,7 @@ def _two_means(sample: _Particles, m: int, num_iterations: int) -> Float[Array, 
         masses, means = weighted_means(features, weights, parent + m * side, 2 * m)
         return jnp.where((masses > 0)[:, None], means, centres)
 
-    return jax.lax.fori_loop(0, num_iterations, iterate, centres)
+    return jax.lax.fori_loop(0, _ITERATIONS, iterate, centres)
 
 
 def free_labels(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import Count, Positive
+from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
 from mpfjax.models.noise import draw_noise
 from mpfjax.moves.base import AbstractResampling, Step
@@ -34,20 +34,17 @@ class GaussianRegeneration(AbstractResampling):
     - `where`: selects the part of the state that is redrawn, such as `lambda state: state.box`. The
       rest (angles, bounded or whole numbers) is copied from resampled particles. None redraws the
       whole state.
-    - `inflation`: of the standard deviations; above 1 it compensates for the loss of spread. No
-      weight corrects for it, as it does in a `GaussNewtonProposal`, so the default is 1.
     - `noise`: "independent"; or "stratified" or "rqmc", which spread the draws of all slots, or of
       each component, evenly. With "rqmc", each component's draws are then ordered along a Hilbert
       curve, as `Propagate(noise="rqmc")` needs them.
 
     With a singular Σ_m, draws stay in its plane; a component of one particle, or of copies of one,
-    gives that particle again. A draw has no single ancestor. Raises `ValueError` for an inflation
-    that is not positive, an unknown noise or particles_per_component < 1.
+    gives that particle again. A draw has no single ancestor. Raises `ValueError` for an unknown
+    noise or particles_per_component < 1.
     """
 
     particles_per_component: Count | None = eqx.field(static=True, default=None, kw_only=True)
     where: Callable[[PyTree], PyTree] | None = eqx.field(static=True, default=None, kw_only=True)
-    inflation: Positive = eqx.field(static=True, default=1.0, kw_only=True)
     noise: Literal["independent", "stratified", "rqmc"] = eqx.field(
         static=True, default="independent", kw_only=True
     )
@@ -110,8 +107,7 @@ class GaussianRegeneration(AbstractResampling):
         states = jnp.where(mixture.occupied[:, None], states - centre[None], 0.0)
         weights = mixture.component_weights.astype(states.dtype)
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
-        factors = self.inflation * cholesky(moments.covariances)
-        factors = spread(factors, vacated.component_indicators)
+        factors = spread(cholesky(moments.covariances), vacated.component_indicators)
         labels, num_components = vacated.component_indicators, mixture.num_components
         noise = draw_noise(key, self.noise, states.shape, states.dtype, labels, num_components)
         offsets = jnp.einsum("nij,nj->ni", factors, noise)
