@@ -127,14 +127,16 @@ def _check_differences(name: str, array: Any) -> None:
         raise ValueError(f"{name}: {where}, or set jax_enable_x64")
 
 
+def _array(value: Any) -> Any:
+    """An array of NumPy, or of JAX where any part of the value is; None of what is none."""
+    of_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        return jnp.asarray(value) if of_jax else np.asarray(value)
+
+
 def _array_of_numbers(name: str, value: Any, may_be_complex: bool = False) -> Any:
     """The argument as an array of its own type, of JAX where any part of it is."""
-    array: Any = value
-    if not isinstance(value, jax.Array):
-        array = None
-        of_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
-        with contextlib.suppress(TypeError, ValueError, OverflowError):
-            array = jnp.asarray(value) if of_jax else np.asarray(value)
+    array = value if isinstance(value, jax.Array) else _array(value)
     # A mask or an imaginary part would later be dropped without a word.
     is_real = may_be_complex or not np.iscomplexobj(array)
     if np.ma.is_masked(value) or not _has_numbers(array) or not is_real:
@@ -168,19 +170,23 @@ def real_array(shape: str, name: str, value: Any) -> Any:
     return array
 
 
+def array_of(shape: str) -> Any:
+    """The type of arrays of this shape, for `isinstance` in a context of `jaxtyping.jaxtyped`."""
+    return jaxtyping.Shaped[Any, shape]
+
+
 def check_shape(shape: str, /, **arguments: Any) -> None:
     """Each argument is an array of numbers of this shape, as "n 4" or "... bins".
 
     Numbers stand for themselves and words for any length; the dots are any axes at all. Traced
     arrays are checked as well.
     """
-    kind: Any = jaxtyping.Shaped[Any, shape]
     for name, value in arguments.items():
         with jaxtyping.jaxtyped("context"):
             axes = ", ".join(shape.split())
             if not _has_numbers(value):
                 raise ValueError(f"{name}: {shown(value)} is no array of numbers, ({axes})")
-            if not isinstance(value, kind):
+            if not isinstance(value, array_of(shape)):
                 raise ValueError(f"{name}: shape {value.shape} is not ({axes})")
 
 
@@ -196,7 +202,7 @@ def to_rows(width: int | None, name: str, value: Any) -> np.ndarray:
 
 
 def _has_numbers(array: Any) -> bool:
-    dtype: Any = getattr(array, "dtype", None)
+    dtype = getattr(array, "dtype", None)
     is_numeric = dtype is not None and any(jnp.issubdtype(dtype, k) for k in (np.number, np.bool_))
     # Durations are whole numbers for numpy. No type of JAX holds long doubles.
     return is_numeric and array.dtype.char not in "mgG"

@@ -110,8 +110,8 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
     """
     require_propagation(filter._now(), "each particle draws")
 
-    def nested(move: AbstractPropagationOfEach) -> AbstractPropagationOfEach:
-        plain: Any = move.propagate if isinstance(move, PropagateNested) else move
+    def nested(move: Any) -> AbstractPropagationOfEach:
+        plain = move.propagate if isinstance(move, PropagateNested) else move
         return plain if num_draws == 1 else PropagateNested(plain, num_draws)
 
     return _map_kind(filter, AbstractPropagationOfEach, nested)

@@ -6,8 +6,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import as_numbers, checked
@@ -17,6 +15,7 @@ from mpfjax.models.observations import (
     NOT_FINITE,
     Series,
     gathered,
+    numpy_for,
     present_steps,
     steps_of_inputs,
 )
@@ -109,7 +108,7 @@ def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Any:
         raise ValueError(f"observations: shape {rows.shape} is not (t, {num_rows})")
     present = present_steps(rows, series, "infinite" if series.skips_missing else NOT_FINITE)
     # In numpy as far as it is known: to JAX with `jax_debug_nans` an array with a NaN is an error.
-    numpy: Any = jnp if any(isinstance(each, Tracer) for each in (rows, present)) else np
+    numpy = numpy_for(rows, present)
     rows = numpy.asarray(rows, dtype)
     return rows if present is None else numpy.where(present[:, None], rows, numpy.nan)
 

@@ -85,7 +85,7 @@ def learn_lookahead(
     if not is_mixed(model):
         require_noise(model, "learn_lookahead")
     series = as_series(observations, model)
-    twist = _knowing_nothing(key, filter, series.length, mapped(model, features) or flatten_states)
+    twist = _knowing_nothing(key, model, filter.num_components, series.length, features)
     learners = _LEARNERS * filter.num_particles
     for pass_key in jax.random.split(key, num_passes):
         run_key, fit_key = jax.random.split(pass_key)
@@ -96,13 +96,17 @@ def learn_lookahead(
 
 
 def _knowing_nothing(
-    key: Key[Array, ""], filter: Filter, length: int, features: Callable[[PyTree], Array]
+    key: Key[Array, ""],
+    model: Any,
+    size: int,
+    length: int,
+    features: Callable[[PyTree], Array] | None,
 ) -> Twist:
     """ψ = 1 at every step."""
-    model: Any = filter.model
+    of_states = mapped(model, features) or flatten_states
     states = jax.eval_shape(lambda key: with_moments(model, model.sample_initial(key, 2)), key)
-    num_features = math.prod(jax.eval_shape(features, states).shape[1:])
-    size, dtype = filter.num_components, noise_dtype(states)
+    num_features = math.prod(jax.eval_shape(of_states, states).shape[1:])
+    dtype = noise_dtype(states)
     noise = jax.eval_shape(lambda states: jnp.zeros(law_of(model).noise_dimension(states)), states)
     one = neutral(size, num_features, noise.shape[0], dtype)
     steps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length + 1, *leaf.shape)), one)
@@ -110,7 +114,7 @@ def _knowing_nothing(
     if is_made_of_noise(model, "initial"):
         # x_0 has no state before it: one feature, which is zero.
         initial = neutral(size, 1, model.initial_noise_dimension, dtype)
-    return Twist(steps, initial, features)
+    return Twist(steps, initial, of_states)
 
 
 def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:

@@ -2,7 +2,6 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +51,7 @@ class PilotLookahead(AbstractLookahead):
 
     def log_factors(self, mixture: ParticleMixture, now: Step) -> Float[Array, " n"]:
         """log ν of each particle, by the weights of the mixture."""
-        model: Any = now.model
+        model = now.model
         states = mixture.particles
         ones = jnp.ones((mixture.num_particles, model.noise_dimension), noise_dtype(states))
         looks = [

@@ -64,7 +64,8 @@ def fit_lookahead(
     whole = jax.tree.map(lambda some, end: jnp.concatenate([some, end[None]]), fitted, last)
     initial = twist.initial
     if initial is not None:
-        initial = _if_finite(_fit_initial(key_initial, filter, twist, initial, first), initial)
+        learned = (filter.model, filter.num_particles, twist, initial, first)
+        initial = _if_finite(_fit_initial(key_initial, *learned), initial)
     return Twist(whole, initial, twist.features)
 
 
@@ -153,16 +154,16 @@ def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
 
 def _fit_initial(
     key: Key[Array, ""],
-    filter: Filter,
+    model: Any,
+    num_particles: int,
     twist: Twist,
     used: LocalQuadratics,
     first: LocalQuadratics,
 ) -> LocalQuadratics:
     """A Gaussian mixture in the noise of x_0: the moments near each expert of ψ_1."""
-    model: Any = filter.model
     num_experts, dimension = used.noise_means.shape
     needed = _PARTICLES_A_COEFFICIENT * _num_coefficients(dimension)
-    size = max(4 * filter.num_particles, 4 * needed * num_experts)
+    size = max(4 * num_particles, 4 * needed * num_experts)
     key_used, key_fitted = jax.random.split(key)
 
     def draw(key: Key[Array, ""], psi: LocalQuadratics) -> tuple[Array, Array, Array]:

@@ -7,9 +7,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, PyTree, Shaped, jaxtyped
+from jaxtyping import Array, Float, Key, PyTree, jaxtyped
 
-from mpfjax.checks import as_numbers, check_shape, shown
+from mpfjax.checks import array_of, as_numbers, check_shape, shown
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models import gaussians
 from mpfjax.models.base import AbstractStateSpaceModel, check_moved, model_name, real_each
@@ -361,8 +361,7 @@ def _checked(model: Any, method: str, parts: Any, n: int, **shapes: str) -> list
     fits = isinstance(parts, tuple | list) and len(parts) == len(shapes)
     with jaxtyped("context"):
         for part, shape in zip(parts, shapes.values(), strict=True) if fits else ():
-            kind: Any = Shaped[Any, shape] | Shaped[Any, f"{n} {shape}"]
-            fits &= isinstance(part, kind)
+            fits &= isinstance(part, (array_of(shape), array_of(f"{n} {shape}")))
     if not fits:
         who = f"model: {model_name(model)}.{method}"
         given = shown(jax.tree.map(jnp.shape, parts))

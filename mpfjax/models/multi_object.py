@@ -153,8 +153,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
 
     @property
     def _noise_dimension(self) -> int:
-        model: Any = self.object_at(0)
-        return self.num_objects * model.noise_dimension
+        return self.num_objects * self.object_at(0).noise_dimension
 
     def _transition_from_noise(self, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
         """x_t of every object, from its own columns of the noise."""
@@ -168,7 +167,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
     # One object at a time. `objects` is the same object for all particles, (), or one of its
     # own for each, (n,); `states` are those of that object, leaves (n, ...).
 
-    def object_at(self, index: int | Int[Array, "*n"]) -> AbstractStateSpaceModel:
+    def object_at(self, index: int | Int[Array, "*n"]) -> Any:
         """The model of one object, or of all where they share it."""
         if not self.per_object:
             return self.object_model

@@ -137,7 +137,7 @@ def present_steps(observations: PyTree, series: Series, refused: str) -> Any:
     A warning says how many steps are skipped of which some numbers are there.
     """
     usable, present = _steps_where(observations, "all", _USABLE[refused]), series.present
-    numpy: Any = jnp if any(isinstance(mask, Tracer) for mask in (usable, present)) else np
+    numpy = numpy_for(usable, present)
     if present is not None:
         check_shape(f"{len(usable)}", present=present)
     present = numpy.ones(usable.shape, bool) if present is None else numpy.asarray(present, bool)
@@ -179,10 +179,15 @@ def refused_by(model: Any) -> str:
     return "infinite" if not law_of(model).is_whole else ""
 
 
+def numpy_for(*arrays: Any) -> Any:
+    """NumPy, whose values can be looked at, or that of JAX where an array is traced."""
+    return jnp if any(isinstance(array, Tracer) for array in arrays) else np
+
+
 def _steps_where(arrays: PyTree, combine: str, holds: Callable[[Any, Any], Any]) -> Any:
     """At which steps it holds for "all" of the numbers, or for "any"; for whole numbers always."""
     leaves = jax.tree.leaves(arrays)
-    numpy: Any = jnp if any(isinstance(leaf, Tracer) for leaf in leaves) else np
+    numpy = numpy_for(*leaves)
     rows = [
         getattr(holds(numpy, leaf).reshape(len(leaf), -1), combine)(axis=1)
         if _is_inexact(leaf)

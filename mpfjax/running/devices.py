@@ -32,9 +32,11 @@ def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
     """
     available = jax.devices()
     if devices is None:
-        default: Any = getattr(jax.config, "jax_default_device", None)
-        one = jax.devices(default) if isinstance(default, str) else [default]
-        chosen = available if default is None else one
+        default = getattr(jax.config, "jax_default_device", None)
+        if default is None:
+            chosen = available
+        else:
+            chosen = jax.devices(default) if isinstance(default, str) else [default]
     else:
         is_number = isinstance(devices, int)
         chosen = available[: max(devices, 0)] if is_number else list(devices)

@@ -261,7 +261,7 @@ def write_described(
     for name, array in arrays.items():
         if array.dtype.hasobject or array.dtype.kind == "V":
             raise ValueError(f"{name}: an array of {array.dtype} does not load without pickles")
-    content: Any = {**arrays, _DESCRIPTION: np.array(json.dumps(description))}
+    content: dict[str, Any] = {**arrays, _DESCRIPTION: np.array(json.dumps(description))}
     write_whole(path, lambda file: np.savez(file, **content))
 
 

@@ -1,7 +1,5 @@
 """What a run remembers: its mixtures from x_0 to x_t, and the ancestors of its particles."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,7 +21,7 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     states began anew (RuntimeError within jit).
     """
     is_run = isinstance(run, FilterRun)
-    mixtures: Any = run.collected if is_run else run
+    mixtures = run.collected if is_run else run
     if not isinstance(mixtures, ParticleMixture) or mixtures.log_weights.ndim != 2:
         raise ValueError("mixtures: these are not all of one run; keep them by collect=None")
     # Smoothing does not use the moves' memory, whose leaves may not stack.

@@ -84,7 +84,7 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate and weigh the objects of every particle in its component's order."""
-        model: Any = now.model
+        model = now.model
         gradient = "stop" if self._stops_draws else "none"
         if is_missing(now):
             return predict(key, model, mixture, gradient)

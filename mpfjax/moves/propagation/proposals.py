@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
@@ -178,7 +178,7 @@ class GaussNewtonProposal(_GaussianProposal):
         self, now: Step, previous_states: Float[Array, "n ..."]
     ) -> tuple[Float[Array, "n d"], Float[Array, "n d d"]]:
         """The means of q, and the Cholesky factors of the precisions Λ."""
-        model: Any = now.model
+        model = now.model
         prior, state_shape = model.transition_mean(previous_states), previous_states.shape[1:]
         prior = prior.reshape(len(prior), -1)
         target = jnp.atleast_1d(now.observation).astype(prior.dtype)

@@ -116,7 +116,7 @@ class PropagateRegimes(AbstractPropagation):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate, and weigh by y_t where it is there."""
-        model: Any = now.model
+        model = now.model
         if is_missing(now):
             pairs = model.all_transitions(mixture.particles.latent)
             family = self._family(mixture, [latent for latent, _ in pairs])
@@ -184,7 +184,7 @@ def children(
     now: Step, state: MarginalisedState
 ) -> tuple[list[PyTree], Float[Array, "k n"], Float[Array, "k n"]]:
     """The K latents that may follow each particle, log p(z_t | z_{t-1}), and that times p(y_t)."""
-    model: Any = now.model
+    model = now.model
     pairs = model.all_transitions(state.latent)
     latents, log_priors = [latent for latent, _ in pairs], jnp.stack([log for _, log in pairs])
     log_densities = [log_predictive(model, now.observation, latent, state) for latent in latents]

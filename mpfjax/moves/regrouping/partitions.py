@@ -1,7 +1,6 @@
 """Groups of another kind than clouds: all particles in one, random sets, and the user's labels."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -87,7 +86,7 @@ class GroupBy(AbstractRegrouping):
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The label of every particle; that of an empty slot is moved into [0, M)."""
         with saying("group of GroupBy", "called with the particles"):
-            labels: Any = self.group(mixture.particles)
+            labels = self.group(mixture.particles)
         n, dtype = mixture.num_particles, getattr(labels, "dtype", float)
         if dtype == jnp.bool_:
             labels, dtype = labels.astype(jnp.int32), jnp.int32

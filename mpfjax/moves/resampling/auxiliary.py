@@ -76,16 +76,19 @@ class AuxiliaryResample(AbstractWrapper):
 
     def _log_factors(self, mixture: ParticleMixture, now: Step) -> Float[Array, " n"]:
         """log ν of each particle, zero in a component where ν is zero throughout."""
-        look: Any = self.lookahead
         with saying("lookahead", "called with an observation and the particles"):
-            if hasattr(look, "log_factors"):
-                values = look.log_factors(mixture, now)
-            elif hasattr(look, "log_normaliser"):
-                values = look.log_normaliser(now, mixture.particles)
-            else:
-                values = look(now.observation, mixture.particles)
+            values = _log_nu(self.lookahead, mixture, now)
         values = real_each(values, mixture.num_particles, "lookahead: it")
         log_factors = values.astype(mixture.log_weights.dtype)
         has_any = mixture.weighed(log_factors).active
         counts = spread(has_any, mixture.component_indicators) | ~(log_factors < jnp.inf)
         return jnp.where(counts, log_factors, 0.0)
+
+
+def _log_nu(look: Any, mixture: ParticleMixture, now: Step) -> Any:
+    """What the look-ahead returns: one of a mixture, a proposal, or a function."""
+    if hasattr(look, "log_factors"):
+        return look.log_factors(mixture, now)
+    if hasattr(look, "log_normaliser"):
+        return look.log_normaliser(now, mixture.particles)
+    return look(now.observation, mixture.particles)

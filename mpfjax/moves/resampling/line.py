@@ -9,7 +9,7 @@ curve.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -222,7 +222,7 @@ def _coordinates(mixture: ParticleMixture, sort_by: SortBy) -> Array:
         dtype = jnp.result_type(*leaves)
         return jnp.concatenate([leaf.astype(dtype).T for leaf in leaves])
     with saying("sort_by", "called with the particles"):
-        values: Any = sort_by(mixture.particles)
+        values = sort_by(mixture.particles)
     if not isinstance(values, jax.Array | np.ndarray) or jnp.iscomplexobj(values):
         raise ValueError(f"sort_by: it returned {shown(values)}, no real array")
     if values.ndim not in (1, 2) or values.shape[0] != n or values.size == 0:
