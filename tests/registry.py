@@ -64,7 +64,6 @@ REGROUPINGS: dict[str, AbstractRegrouping] = {
     "random labels": RandomLabels(),
     "pool": Pool(),
     "random partition": RandomPartition(),
-    "random partition in two": RandomPartition(2),
     "grouped by a label": GroupBy(lambda states: (states[:, 0] > 0).astype(jnp.int32)),
 }
 
@@ -193,8 +192,8 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "pf rqmc of many initial draws": lambda model: mpfjax.with_proposals_per_particle(
         mpfjax.with_selected_start(_pf(noise="rqmc")(model), 3), 2
     ),
-    "auxiliary pf, adaptive": lambda model: mpfjax.auxiliary_particle_filter(
-        model, NUM_PARTICLES, GaussNewtonProposal(), ess_threshold=0.5
+    "auxiliary pf, adaptive": lambda model: mpfjax.with_lookahead(
+        _pf(ess_threshold=0.5)(model), GaussNewtonProposal()
     ),
     "auxiliary mpf": lambda model: mpfjax.with_lookahead(_mpf()(model), Halfway()),
     "guided pf": _pf(proposal=GaussNewtonProposal()),
@@ -238,9 +237,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "independent filters": _joint(
         lambda joint: mpfjax.independent_particle_filters(joint, NUM_PARTICLES)
     ),
-    "clusters": _joint(
-        lambda joint: mpfjax.clustered_particle_filter(joint, NUM_PARTICLES, scheme="stratified")
-    ),
+    "clusters": _joint(lambda joint: mpfjax.clustered_particle_filter(joint, NUM_PARTICLES)),
     "objects that cross in one cluster": _joint(
         lambda joint: mpfjax.clustered_particle_filter(joint, NUM_PARTICLES, start="together")
     ),

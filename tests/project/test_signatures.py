@@ -34,12 +34,8 @@ DIFFERENT = {
     "exponent",  # of a likelihood; of a distance
     "first",  # of a folder's frames, the first; of a tracker's, that of the detections
     "frames_per_second",  # of a tracker None asks; a video that is written must have one
-    "inflation",  # weights correct a proposal's, and nothing that of a Gaussian regeneration
-    "least_existence",  # below which an object ends; from which it is shown
-    "num_draws",  # of a particle's proposals; of a smoothed term's ancestors
     "num_iterations",  # of Newton, of K-means from seeds, and within one component
     "num_moves",  # of states at each step; of parameters, which must cross their posterior
-    "num_particles",  # of a look-ahead's filter, by default its own; of an alarm's draws
     "num_seeds",  # an estimate's gradient, a function that need not be random, a matrix
     "reassembly",  # the paper's of its filter; the unbiased one of a move
     "regroup_every",  # a Gaussian of two modes loses both, a component of particles does not

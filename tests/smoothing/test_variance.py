@@ -1,5 +1,6 @@
 """Errors of log Ẑ and of masses from one run, against many runs and the exact pairs of one."""
 
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -40,7 +41,10 @@ SMALL = {
     "pf": (mpfjax.particle_filter(ONE, 30, **DRAWS), SEEN),
     "kmeans, adaptive": (labelled(ONE, 30, 0.5, KMeans()), SEEN),
     "dps": (
-        mpfjax.distributed_partitioned_sampling(OBJECTS, 30, reassembly="evidence", **DRAWS),
+        mpfjax.map_moves(
+            mpfjax.distributed_partitioned_sampling(OBJECTS, 30, reassembly="evidence"),
+            lambda move: replace(move, **DRAWS) if isinstance(move, Resample) else move,
+        ),
         np.stack([SEEN, -SEEN], axis=1),
     ),
 }
