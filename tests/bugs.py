@@ -43,11 +43,11 @@ BUGS = {
         "log_factors.append(law.log_transition(draws, previous) + log_density)",
         "tests/together/test_exact_answers.py -k guided",
     ),
-    "MALA forgets its step back": Bug(
+    "Metropolis moves forget where they are": Bug(
         "moves/metropolis.py",
-        "reverse = forth + drift(proposed) + noise",
-        "reverse = forth + forth + noise",
-        "tests/together/test_exact_answers.py -k Langevin",
+        "target.ratio(target(proposed), first)",
+        "target.ratio(target(proposed), target(target.parents))",
+        "tests/together/test_exact_answers.py -k metropolis",
     ),
     "prior masses of DPS count the dead": Bug(
         "moves/objects/partitioned.py",
@@ -125,12 +125,6 @@ BUGS = {
         "tests/vision/test_tracker.py -k shaking",
     ),
     # Propagation, several objects, look-aheads.
-    "tempered moves draw everything by one key": Bug(
-        "moves/propagation/tempered.py",
-        "key_step, key_noise, key_taken = split(key, 3)",
-        "key_step, key_noise, key_taken = key, key, key",
-        "tests/moves/test_tempered.py",
-    ),
     "a start forgets p(x_0)": Bug(
         "moves/start/sampler.py",
         "return log_prior + paths.log_past + power * paths.log_likelihood",
