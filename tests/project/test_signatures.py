@@ -41,7 +41,6 @@ DIFFERENT = {
     "regroup_every",  # a Gaussian of two modes loses both, a component of particles does not
     "resample",  # where None is the one that fits the number of targets
     "threshold",  # a share of islands; grey levels
-    "within",  # propagations; a mixture, of which there is nothing outside a step
 }
 
 
