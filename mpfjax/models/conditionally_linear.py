@@ -25,7 +25,7 @@ from mpfjax.models.gaussians import (
     solve_upper,
     transposed,
 )
-from mpfjax.models.law import Law
+from mpfjax.models.law import Law, law_of
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import normal
@@ -87,7 +87,7 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
     handles_missing = True
 
     @property
-    def law(self) -> Any:
+    def _law(self) -> Any:
         """The class of the model's law."""
         return MixedLaw if is_mixed(self) else MarginalisedLaw
 
@@ -174,7 +174,7 @@ def log_predictive(
     model: Any, observation: PyTree, latent: PyTree, state: MarginalisedState
 ) -> Float[Array, " n"]:
     """log p(y_t | z_t, z, y_1..y_{t-1}) of each particle, what is seen of z_t included."""
-    log_density = model.law(model).log_likelihood_of_draws(observation, latent)
+    log_density = law_of(model).log_likelihood_of_draws(observation, latent)
     emission = emission_of(model, latent, state)
     if emission is None:
         return log_density

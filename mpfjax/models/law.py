@@ -26,7 +26,7 @@ class Law:
 
     `draws` are the random part of the states: the states themselves here; the latent z_t where the
     particles carry moments of the rest (`MarginalisedLaw`, which such a model names in its
-    attribute `law`).
+    attribute `_law`).
     """
 
     model: Any
@@ -128,7 +128,7 @@ class Law:
 
 def law_of(model: Any) -> Law:
     """The law of this model."""
-    return getattr(model, "law", Law)(model)
+    return getattr(model, "_law", Law)(model)
 
 
 def refuse_marginalised(

@@ -1,0 +1,421 @@
+"""The questions of the matrix: each asks one thing of a model, its data and a filter.
+
+A `Row` is a model and a filter; its questions share programs and runs.
+"""
+
+import copy
+import functools
+import pickle
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import mpfjax
+from mpfjax import smoothing, tuning
+from mpfjax.moves.base import all_of
+from tests.matrix import law as exact
+from tests.matrix.data import Y, case
+from tests.matrix.filters import FILTERS, OF_ANOTHER_LAW, OF_OTHER_EVIDENCE, N
+from tests.matrix.models import FORMS, moments_of
+from tests.unbiased import assert_unbiased
+
+NUM_RUNS = 1000
+KEYS = jax.random.split(jax.random.key(0), NUM_RUNS)
+# What rounding may do to log Z: a shift of a million leaves a sixteenth of a step.
+SLACK = {"shift up": 0.13, "shift down": 0.13}
+LEAST, OF_APPROXIMATE = 4e-3, 0.1
+
+
+def unit_of(case):
+    return float(np.sqrt(case.answer.variances[-1]))
+
+
+class Row:
+    """A form of the model and a filter."""
+
+    def __init__(self, form: str, filter: str) -> None:
+        self.form, self.name, self.make = FORMS[form], filter, FILTERS[filter]
+        self.moments = moments_of(self.form)
+        self.case = functools.cache(lambda data: case(form, data))
+        self.filter = functools.cache(lambda data: self.make(self.case(data).model))
+        self._runs = functools.cache(self._of_runs)
+
+    def runs(self, data: str, slots: int | None = None):
+        """A thousand runs, with their warnings each time that they are asked for."""
+        run, caught = self._runs(data, slots)
+        for warning in caught:
+            warnings.warn(warning.message, stacklevel=2)
+        return run
+
+    def _of_runs(self, data: str, slots: int | None):
+        filter, series = self.filter(data), self.case(data).series
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            return mpfjax.monte_carlo(KEYS, filter, series, self.moments, slots=slots), caught
+
+    def ratios(self, data, increments):
+        """Ẑ/Z of each run, but for the steps without any likelihood."""
+        case = self.case(data)
+        gaps = np.asarray(increments, float) - case.answer.increments
+        return np.exp(np.where(np.isfinite(gaps), gaps, 0.0).sum(axis=-1))
+
+    def check(self, data, ratios, first=None, second=None, expected=None):
+        """The estimates of all runs are those of the answer, within four standard errors."""
+        case, approximate = self.case(data), self.filter(data).approximate
+        if approximate and self.name in OF_ANOTHER_LAW:
+            return
+        slack = SLACK.get(data, LEAST) + OF_APPROXIMATE * approximate
+        if first is None:
+            assert_unbiased(ratios, loosest=0.7 if data == "wide prior" else 0.06, slack=slack)
+            return
+        mean, variance = expected or (case.answer.means[-1], case.answer.variances[-1])
+        # In standard deviations of x about its mean, so that no digit is lost to large numbers.
+        gaps = (np.asarray(first, float) - mean) / np.sqrt(variance)
+        weights = np.ones_like(ratios) if approximate else ratios
+        assert_unbiased(weights * gaps, 0.0, loosest=0.06, slack=slack)
+        if second is not None:
+            shares = np.asarray(second, float) / variance + gaps**2
+            assert_unbiased(weights * (shares - 1), 0.0, loosest=0.12, slack=2 * slack)
+
+
+def evidence(row, data):
+    run = row.runs(data)
+    if row.name in OF_OTHER_EVIDENCE:
+        return
+    row.check(data, row.ratios(data, run.log_likelihood_increments))
+    blind = np.arange(len(Y)) == (1 if data == "zero likelihood" else -1)
+    np.testing.assert_array_equal(run.degenerate, np.broadcast_to(blind, run.degenerate.shape))
+
+
+def moments(row, data):
+    run = row.runs(data)
+    first, second = run.collected
+    ratios = row.ratios(data, run.log_likelihood_increments)
+    row.check(data, ratios, first[:, -1], second[:, -1])
+
+
+def slots(row, data):
+    run = row.runs(data, N + 24)
+    ratios = row.ratios(data, run.log_likelihood_increments)
+    row.check(data, ratios)
+    row.check(data, ratios, *(moment[:, -1] for moment in run.collected))
+
+
+def islands(row, data):
+    filter, series = row.filter(data), row.case(data).series
+
+    def run(key):
+        run = mpfjax.run_islands(
+            key, filter, series, lambda mixture: mixture.average(row.form.value(mixture.particles)),
+            num_islands=2,
+        )  # fmt: skip
+        return run.log_likelihood_increments, row.moments(run.final), run.collected[-1].sum()
+
+    increments, found, total = jax.jit(jax.vmap(run))(KEYS)
+    ratios = row.ratios(data, increments)
+    row.check(data, ratios)
+    row.check(data, ratios, *found)
+    row.check(data, ratios, total)
+
+
+def stepped(row, data, after=lambda filter, mixture: (filter, mixture)):
+    """The mixtures and increments of one run, step by step."""
+    case, filter = row.case(data), row.filter(data)
+    series = mpfjax.models.observations.as_series(case.series, case.model)
+    key_initial, key_steps = jax.random.split(KEYS[0])
+
+    def at(tree, t):
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[t]), tree)
+
+    is_there = np.ones(len(Y), bool) if series.present is None else np.asarray(series.present)
+    first = at(series.observations, 0) if is_there[0] else None
+    mixture, increments = filter.init(key_initial, first, inputs=at(series.inputs, 0)), []
+    for t, key in enumerate(jax.random.split(key_steps, len(Y))):
+        now = at(series.inputs, t)
+        if is_there[t]:
+            seen = at(series.observations, t)
+            mixture, info = filter.step(key, mixture, seen, inputs=now)
+        else:
+            mixture, info = filter.predict(key, mixture, inputs=now)
+        increments.append(float(info.log_likelihood_increment))
+        if t == 1:
+            filter, mixture = after(filter, mixture)
+    return mixture, np.array(increments)
+
+
+def same(row, data, found):
+    """A run's increments and moments are those of these steps."""
+    run = mpfjax.run_filter(KEYS[0], row.filter(data), row.case(data).series, row.moments)
+    mixture, increments = found
+    slack = SLACK.get(data, 1e-3)
+    np.testing.assert_allclose(increments, run.log_likelihood_increments, rtol=1e-3, atol=slack)
+    expected = [np.asarray(moment[-1]) for moment in run.collected]
+    unit = unit_of(row.case(data))
+    np.testing.assert_allclose(row.moments(mixture)[0] / unit, expected[0] / unit, atol=2e-2)
+
+
+def steps(row, data):
+    same(row, data, stepped(row, data))
+
+
+def checkpoint(row, data):
+    def stored(filter, mixture):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "state.npz"
+            mpfjax.save_checkpoint(path, mixture)
+            like = jax.tree.map(jnp.zeros_like, mixture)
+            return filter, mpfjax.load_checkpoint(path, like)
+
+    same(row, data, stepped(row, data, stored))
+
+
+def pickled(row, data):
+    def there_and_back(filter, mixture):
+        filter = copy.deepcopy(pickle.loads(pickle.dumps(filter)))
+        return filter, pickle.loads(pickle.dumps(mixture))
+
+    same(row, data, stepped(row, data, there_and_back))
+
+
+def forecast(row, data):
+    case, filter, run = row.case(data), row.filter(data), row.runs(data)
+    inputs = case.series.inputs
+    if inputs is not None:
+        inputs = jax.tree.map(lambda leaf: leaf[:1], inputs)
+
+    def ahead(key, mixture):
+        mixtures = mpfjax.forecast(key, filter, mixture, 1, inputs=inputs).mixtures
+        return row.moments(jax.tree.map(lambda leaf: leaf[0], mixtures))
+
+    found = jax.jit(jax.vmap(ahead))(KEYS, run.final)
+    ratios = row.ratios(data, run.log_likelihood_increments)
+    row.check(data, ratios, *found, expected=case.answer.ahead)
+
+
+def score(row, data):
+    """Of the filter with gradient "stop", unless it declares that its score is biased."""
+    case = row.case(data)
+    filter = mpfjax.with_score_gradient(row.filter(data))
+    if any(move.biases_score for move in all_of((*filter.initial_moves, *filter.moves))):
+        return
+    names = ("a", "q", "r", "m0")
+
+    def log_evidence(numbers, key):
+        law = case.law._replace(**numbers)
+        inputs = row.form.inputs and jax.tree.map(jnp.asarray, row.form.inputs(law, case.u))
+        filter = mpfjax.with_score_gradient(row.make(row.form.make(law)))
+        series = mpfjax.Series(
+            jnp.asarray(case.series.observations), inputs, present=case.series.present
+        )
+        run = mpfjax.run_filter(key, filter, series, lambda mixture: None)
+        return run.log_marginal_likelihood, run.log_likelihood_increments
+
+    numbers = {name: jnp.asarray(float(getattr(case.law, name))) for name in names}
+    slope = jax.jit(jax.vmap(jax.grad(log_evidence, has_aux=True), in_axes=(None, 0)))
+    slopes, increments = slope(numbers, KEYS)
+    ratios = row.ratios(data, increments)
+    for name in names:
+        expected = exact.score(case.law, case.y, case.u, name)
+        assert_unbiased(ratios * np.asarray(slopes[name], float), expected, loosest=0.5, slack=0.02)
+
+
+def smoothed(row, data, smooth):
+    """Ẑ/Z times the smoothed means of x_1, ..., x_t, and of x_0 where they are there."""
+    answer = row.case(data).answer
+    increments, found = jax.jit(jax.vmap(smooth))(KEYS[:300])
+    ratios, found = row.ratios(data, increments), np.asarray(found, float)
+    expected = answer.smoothed[-found.shape[1] :]
+    unit = unit_of(row.case(data))
+    gaps = ratios[:, None] * (found - expected[None]) / unit
+    assert_unbiased(gaps, 0.0, loosest=0.1, slack=SLACK.get(data, LEAST))
+
+
+def of_run(method):
+    def ask(row, data):
+        case, filter = row.case(data), row.filter(data)
+
+        def smooth(key):
+            run = mpfjax.run_filter(key, filter, case.series)
+            paths = method(jax.random.fold_in(key, 7), filter.model, run, case.series)
+            return run.log_likelihood_increments, jax.vmap(row.form.value)(paths).mean(axis=0)
+
+        smoothed(row, data, smooth)
+
+    return ask
+
+
+def backward(**options):
+    def draw(key, model, run, series):
+        is_linear = hasattr(model, "dynamics")
+        data = {"observations": series} if is_linear else {"inputs": series.inputs}
+        return smoothing.sample_trajectories(key, model, run, 8, **data, **options)
+
+    return of_run(draw)
+
+
+def sums(**options):
+    def ask(row, data):
+        case, filter = row.case(data), row.filter(data)
+        value = row.form.value
+
+        def smooth(key):
+            found = smoothing.smoothed_sums(
+                key, filter, case.series, lambda before, now: value(now), lag=len(Y), **options
+            )
+            return found.run.log_likelihood_increments, found.terms
+
+        smoothed(row, data, smooth)
+
+    return ask
+
+
+def genealogy(row, data):
+    case, filter = row.case(data), row.filter(data)
+
+    def smooth(key):
+        run = mpfjax.run_filter(key, filter, case.series)
+        paths = smoothing.trace_ancestors(run).trajectories
+        means = run.final.average(jax.vmap(row.form.value)(paths))
+        return run.log_likelihood_increments, means
+
+    smoothed(row, data, smooth)
+
+
+def conditional(row, data):
+    """Chains from an ordinary run's trajectory: a draw of theirs has the smoothing law."""
+    case, filter = row.case(data), row.filter(data)
+
+    def smooth(key):
+        key, own = jax.random.split(key)
+        run = mpfjax.run_filter(own, filter, case.series)
+        path = jax.tree.map(
+            lambda leaf: leaf[0],
+            smoothing.sample_trajectories(own, filter.model, run, 1, inputs=case.series.inputs),
+        )
+
+        def renewed(path, own):
+            path = smoothing.conditional_filter(own, filter, case.series, path).trajectory
+            return path, row.form.value(path)
+
+        _, means = jax.lax.scan(renewed, path, jax.random.split(key, 4))
+        return jnp.asarray(case.answer.increments), means.mean(axis=0)
+
+    smoothed(row, data, smooth)
+
+
+def log_prior(parameters):
+    return -0.5 * jnp.sum(parameters["c"] ** 2)
+
+
+def sampler(run):
+    """The posterior of c under a standard normal prior, over chains."""
+
+    def ask(row, data):
+        case, form = row.case(data), row.form
+        shape = jnp.shape(form.offset(case.model))
+        common: dict[str, Any] = {
+            "parameters": {"c": lambda filter: form.offset(filter.model)},
+            "progress": False,
+        }
+
+        def sample_prior(key):
+            return {"c": jax.random.normal(key, shape)}
+
+        found = run(row, data, sample_prior, common)
+        mean, variance = exact.posterior(case.law, case.y, case.u, answer=form.answer)
+        gaps = (np.asarray(found, float) - mean) / np.sqrt(variance)
+        assert_unbiased(gaps, 0.0, loosest=0.15)
+
+    return ask
+
+
+CHAINS: dict[str, Any] = {"num_chains": 60, "burn_in": 10}
+
+
+def of_chains(posterior):
+    draws = np.asarray(posterior.parameters["c"], float)
+    return draws.reshape(*draws.shape[:2], -1)[..., 0].mean(axis=1)
+
+
+@sampler
+def metropolis(row, data, sample_prior, common):
+    return of_chains(
+        tuning.metropolis_hastings(
+            KEYS[0], row.filter(data), row.case(data).series, 40, log_prior=log_prior,
+            sample_prior=sample_prior, proposal_deviations=0.8, **CHAINS, **common,
+        )
+    )  # fmt: skip
+
+
+@sampler
+def gibbs(row, data, sample_prior, common):
+    return of_chains(
+        tuning.particle_gibbs(
+            KEYS[0], row.filter(data), row.case(data).series, 40, log_prior=log_prior,
+            sample_prior=sample_prior, proposal_deviations=0.8, **CHAINS, **common,
+        )
+    )  # fmt: skip
+
+
+@sampler
+def gibbs_draw(row, data, sample_prior, common):
+    """The draw's own formula leaves out what is NaN, as it is told to."""
+    value, r = row.form.value, row.case(data).law.r
+
+    def draw(key, trajectory, observations, model):
+        y = observations.reshape(len(Y))
+        gaps = jnp.where(jnp.isnan(y), 0.0, y - value(trajectory)[1:])
+        precision = 1 + jnp.sum(~jnp.isnan(y)).astype(float) / r**2
+        mean = jnp.sum(gaps) / r**2 / precision
+        shape = jnp.shape(row.form.offset(model))
+        return {"c": mean + jax.random.normal(key, shape) / jnp.sqrt(precision)}
+
+    return of_chains(
+        tuning.particle_gibbs(
+            KEYS[0], row.filter(data), row.case(data).series, 40, draw=draw,
+            sample_prior=sample_prior, **CHAINS, **common,
+        )
+    )  # fmt: skip
+
+
+@sampler
+def smc2(row, data, sample_prior, common):
+    keys = jax.random.split(jax.random.key(1), 8)
+    found = [
+        tuning.smc2(
+            key, row.filter(data), row.case(data).series, 120, log_prior=log_prior,
+            sample_prior=sample_prior, **common,
+        ).mean("c")
+        for key in keys
+    ]  # fmt: skip
+    return np.reshape(found, (8, -1))[:, 0]
+
+
+# The first share one program for all data, and one more where something is missing.
+OF_RUNS: dict[str, Callable] = {"log Z": evidence, "moments": moments}
+OTHERS: dict[str, Callable] = {
+    "steps": steps,
+    "checkpoint": checkpoint,
+    "pickle": pickled,
+    "slots": slots,
+    "islands": islands,
+    "forecast": forecast,
+    "score": score,
+    "trajectories": backward(),
+    "trajectories, mcmc": backward(method="mcmc", num_moves=8),
+    "sums": sums(),
+    "sums, mcmc": sums(method="mcmc", num_draws=4),
+    "genealogy": genealogy,
+    "conditional filter": conditional,
+    "Metropolis": metropolis,
+    "Gibbs": gibbs,
+    "Gibbs, draw": gibbs_draw,
+    "SMC²": smc2,
+}
+QUESTIONS = OF_RUNS | OTHERS

@@ -1,0 +1,108 @@
+"""Wherever two mechanisms meet, the number is right or the call is refused.
+
+A row is a form of the model and a filter, whose cells share programs; `table.py` says which of them
+are not right. A sample of the rows runs before every landing, all of them weekly.
+"""
+
+import re
+import warnings
+
+import pytest
+
+from tests.marking import quick_of
+from tests.matrix.data import FOR
+from tests.matrix.filters import FILTERS, MOVES, PAIRS, RECIPES, SINGLE, parts
+from tests.matrix.models import FORMS
+from tests.matrix.questions import OF_RUNS, OTHERS, QUESTIONS, Row
+from tests.matrix.table import AFTER_START, RULES, rules_of
+
+SINGLES = [*RECIPES, *SINGLE, *MOVES]
+GAPS = ("complete", "NaN", "present")
+
+
+def outcome(row, form, data, filter, question):
+    """What is amiss with the cell; None where it is as the table says."""
+    rules = rules_of(form, data, filter, question)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            QUESTIONS[question](row, data)
+            said = None
+        except ValueError as error:
+            said = str(error)
+        except AssertionError as error:
+            said = error
+    if not rules:
+        return said
+    warned = " ".join(str(warning.message) for warning in caught)
+    for rule in rules:
+        text = warned if rule.warns else said
+        if isinstance(text, str) and re.search(rule.says, text):
+            return None
+    return f"not refused as the table says: {said}; {warned}"
+
+
+def check(form, filter, cells):
+    row, amiss = Row(form, filter), {}
+    for data, question in cells:
+        if question in ("Gibbs, draw", "Gibbs", "Metropolis", "SMC²") and row.form.offset is None:
+            continue
+        if (said := outcome(row, form, data, filter, question)) is not None:
+            amiss[data, question] = " ".join(str(said).split())[:300]
+    assert not amiss, "\n".join(f"{cell}: {said}" for cell, said in amiss.items())
+
+
+def known(rows):
+    return [row for row in rows if not AFTER_START & parts(row[1])]
+
+
+def cells(datas, questions):
+    return [(data, question) for data in datas for question in questions]
+
+
+@pytest.mark.parametrize("form", quick_of(FORMS, ["made of noise"], one_in=1))
+def test_data(form):
+    """All data, by a particle filter."""
+    check(form, "particle", cells(FOR[FORMS[form].data], OF_RUNS))
+
+
+ROWS = known([(form, filter) for filter in SINGLES for form in FORMS])
+
+
+@pytest.mark.parametrize(("form", "filter"), quick_of(ROWS, [], one_in=20))
+def test_filters(form, filter):
+    """Every recipe, transform and class of move, of every form."""
+    check(form, filter, cells(GAPS, OF_RUNS))
+
+
+OF_PAIRS = known([(form, pair) for pair in PAIRS for form in ("inputs", "conditionally linear")])
+
+
+@pytest.mark.parametrize(("form", "pair"), quick_of(OF_PAIRS, [], one_in=20))
+def test_pairs_of_transforms(form, pair):
+    """In either order."""
+    check(form, pair, cells(GAPS, OF_RUNS))
+
+
+ASKED = [(form, question) for form in FORMS for question in OTHERS]
+
+
+@pytest.mark.parametrize(("form", "question"), quick_of(ASKED, [], one_in=12))
+def test_questions_of_forms(form, question):
+    """Every question of every form, also where something is missing."""
+    check(form, "particle", cells(GAPS, [question]))
+
+
+OF_FILTERS = [(f, q) for q in OTHERS for f in SINGLES if not AFTER_START & parts(f)]
+
+
+@pytest.mark.parametrize(("filter", "question"), quick_of(OF_FILTERS, [], one_in=30))
+def test_questions_of_filters(filter, question):
+    """Every question of every filter, of the form that it takes."""
+    form = next(form for form in ("inputs", "one of several", "targets", "switching") if not
+                [rule for rule in RULES if rule.holds(form, "complete", filter, "log Z")])  # fmt: skip
+    check(form, filter, cells(("NaN",), [question]))
+
+
+def test_every_filter_has_a_form():
+    assert set(FILTERS) == {*SINGLES, *PAIRS}
