@@ -18,6 +18,7 @@ from mpfjax.models.observations import (
     numpy_for,
     present_steps,
     steps_of_inputs,
+    with_gaps,
 )
 
 
@@ -108,9 +109,7 @@ def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Any:
         raise ValueError(f"observations: shape {rows.shape} is not (t, {num_rows})")
     present = present_steps(rows, series, "infinite" if series.skips_missing else NOT_FINITE)
     # In numpy as far as it is known: to JAX with `jax_debug_nans` an array with a NaN is an error.
-    numpy = numpy_for(rows, present)
-    rows = numpy.asarray(rows, dtype)
-    return rows if present is None else numpy.where(present[:, None], rows, numpy.nan)
+    return with_gaps(numpy_for(rows, present).asarray(rows, dtype), present)
 
 
 @eqx.filter_jit

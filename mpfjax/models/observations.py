@@ -153,6 +153,24 @@ def present_steps(observations: PyTree, series: Series, refused: str) -> Any:
     return None if numpy is np and present.all() else jnp.asarray(present)
 
 
+def with_gaps(observations: PyTree, present: Any) -> PyTree:
+    """The observations with NaN for each number of a step that is not present.
+
+    So data leave a `Series`: what stands there instead is never looked at. Whole numbers become
+    floating point numbers.
+    """
+    if present is None:
+        return observations
+    numpy = numpy_for(*jax.tree.leaves(observations), present)
+
+    def gap(leaf: Any) -> Any:
+        leaf = leaf if _is_inexact(leaf) else leaf.astype(jnp.result_type(float))
+        there = numpy.asarray(present).reshape(-1, *(1,) * (leaf.ndim - 1))
+        return numpy.where(there, leaf, numpy.asarray(numpy.nan, leaf.dtype))
+
+    return jax.tree.map(gap, observations)
+
+
 def _warn_of_parts(observations: PyTree, skipped: Bool[np.ndarray, " t"]) -> None:
     inexact = [leaf for leaf in jax.tree.leaves(observations) if _is_inexact(leaf)]
     if inexact:

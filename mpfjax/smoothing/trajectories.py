@@ -12,7 +12,14 @@ from mpfjax.checks import Count, CountOrZero, checked, warn
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, require, with_inputs
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
-from mpfjax.models.observations import as_arrays, gathered, steps_of_inputs
+from mpfjax.models.observations import (
+    as_arrays,
+    gathered,
+    present_steps,
+    refused_by,
+    steps_of_inputs,
+    with_gaps,
+)
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
@@ -85,6 +92,8 @@ def sample_trajectories(
         _check_component(stacked, component)
     if is_marginalised(model) or observations is not None:
         observations = as_arrays(observations)
+        present = present_steps(observations, series, refused_by(model))
+        observations = with_gaps(observations, present)
         check_marginalised(model, stacked, observations, method)
         drawn, indices = sample_marginalised(
             key, model, stacked, observations, inputs, num_trajectories, component

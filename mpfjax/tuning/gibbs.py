@@ -14,7 +14,7 @@ from mpfjax.checks import Count, checked, saying
 from mpfjax.filter import Filter
 from mpfjax.models.base import require, with_inputs
 from mpfjax.models.law import law_of
-from mpfjax.models.observations import Series
+from mpfjax.models.observations import Series, with_gaps
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.conditional import (
@@ -237,7 +237,8 @@ class _Kernel(AbstractKernel):
         """The user's draw, in unconstrained numbers."""
         filter = self.problem.at(reals)
         with saying("draw", "called with a key, trajectory, observations and model"):
-            observations = self.problem.objective.series.observations
+            series = self.problem.objective.series
+            observations = with_gaps(series.observations, series.present)
             drawn = cast(Draw, self.draw)(key, trajectory, observations, filter.model)
         return self.problem.unconstrain(drawn, "draw")
 

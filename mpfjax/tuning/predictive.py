@@ -11,7 +11,7 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count, checked, optional, shown
 from mpfjax.models.base import require
-from mpfjax.models.observations import steps_of_inputs
+from mpfjax.models.observations import steps_of_inputs, with_gaps
 from mpfjax.models.trial import steps_ahead
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.tuning.gibbs import GibbsPosterior
@@ -131,9 +131,8 @@ def to_inference_data(
     elif isinstance(result, PosteriorTrajectories):
         states = _named("state", result.states)
         again = _named("observation", result.observations)
-        seen = _named("observation", result.observed.observations)
-        if (present := result.observed.present) is not None:
-            seen = {name: _where_present(leaf, np.asarray(present)) for name, leaf in seen.items()}
+        observed = result.observed
+        seen = _named("observation", with_gaps(observed.observations, observed.present))
     else:
         states = {name: leaf[None] for name, leaf in _named("state", result).items()}
         stacks = {leaf.shape[:3] if leaf.dtype.kind in "iufc" else () for leaf in states.values()}
@@ -168,9 +167,3 @@ def _named(whole: str, tree: PyTree) -> dict[str, np.ndarray]:
         whole + re.sub(r"[^\w]+", "_", jax.tree_util.keystr(path)).rstrip("_"): np.asarray(leaf)
         for path, leaf in named
     }
-
-
-def _where_present(leaf: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """The observations, NaN in steps where they are missing."""
-    mask = present.reshape(-1, *[1] * (leaf.ndim - 1))
-    return np.where(mask, leaf, np.nan)
