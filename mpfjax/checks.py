@@ -338,7 +338,8 @@ class Checked(eqx.Module):
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         """Raise a `TypeError` for arguments that its `__init__` does not take."""
-        _bound(cls.__init__, (None, *args), kwargs)
+        if args or kwargs:  # copies and pickles are made of none, and filled afterwards
+            _bound(cls.__init__, (None, *args), kwargs)
         return super().__new__(cls)
 
     def __check_init__(self) -> None:

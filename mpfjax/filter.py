@@ -102,8 +102,8 @@ class Filter(eqx.Module):
 
     @property
     def approximate(self) -> bool:
-        """Whether any move departs from the exact recursion."""
-        return any(move.approximate for move in self.moves)
+        """Whether any move departs from the exact recursion, also of those of x_0."""
+        return any(move.approximate for move in (*self.initial_moves, *self.moves))
 
     @property
     def weighs_initially(self) -> bool:
@@ -177,6 +177,7 @@ class Filter(eqx.Module):
         model = with_inputs(self.model, inputs)
         return Step(
             model, observation, inputs=inputs, initial_model=self.model, moves=self.moves,
+            initial_moves=self.initial_moves, initial_noise=self.initial_noise,
             is_initial=is_initial,
         )  # fmt: skip
 

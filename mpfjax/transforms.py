@@ -14,6 +14,7 @@ from mpfjax.moves.base import (
     AbstractProposal,
     AbstractRegrouping,
     all_of,
+    name_of,
 )
 from mpfjax.moves.every import Every
 from mpfjax.moves.initial import SelectInitial, require_propagation
@@ -95,9 +96,14 @@ def with_score_gradient(filter: Filter) -> Filter:
     """The filter whose derivatives estimate the score, for tuning: gradient "stop" everywhere.
 
     Ścibior and Wood (2021); values are the same to the bit. It reaches the resampling inside of
-    propagations too. Raises `ValueError` for a model without `log_transition`.
+    propagations too. Raises `ValueError` for a model without `log_transition`, and for moves of
+    which derivatives do not see all that is drawn (`biases_score`).
     """
-    return _everywhere(filter, "gradient", "stop")
+    changed = _everywhere(filter, "gradient", "stop")
+    for move in all_of((*changed.initial_moves, *changed.moves)):
+        if move.biases_score:
+            raise ValueError(f"filter: derivatives do not see all that {name_of(move)} draws")
+    return changed
 
 
 @checked

@@ -68,6 +68,8 @@ class TwistInitial(AbstractMove):
     twist: Twist
     noise: str = eqx.field(static=True, default="independent")
 
+    approximate = False
+
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """The mixture of the twisted draws."""
         if self.twist.initial is None:

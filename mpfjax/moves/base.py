@@ -33,6 +33,10 @@ class Step(eqx.Module):
     """the filter's model without inputs, whose p(x_0) is the prior; None where it is `model`."""
     moves: "Moves" = eqx.field(default=(), kw_only=True)
     """the filter's own chain."""
+    initial_moves: "Moves" = eqx.field(default=(), kw_only=True)
+    """those of x_0."""
+    initial_noise: str = eqx.field(static=True, default="independent", kw_only=True)
+    """what x_0 is made of."""
     is_initial: bool = eqx.field(static=True, default=False, kw_only=True)
     """whether it is x_0 that is moved, with y_1 for an observation, if that is known."""
 
@@ -78,8 +82,9 @@ class AbstractMove(Given):
     the move says in the attributes and methods below.
     """
 
-    approximate = False
-    """whether the move is not part of the exact recursion, so that Ẑ is no longer unbiased."""
+    approximate = True
+    """whether the move is not part of the exact recursion, so that Ẑ is no longer unbiased. A class
+    says that it is: nothing is known of others."""
     weighs = True
     """whether it may change the weights by what was observed; a filter needs one that does."""
     keeps_mass = False
@@ -93,9 +98,9 @@ class AbstractMove(Given):
     keeps_families = True
     """whether it draws independently, or tells the memory of Eve indices, so that the errors of
     one run are known."""
-    biases_score = False
+    biases_score = True
     """whether it redraws particles in a way that derivatives in the model's parameters do not see,
-    so that the score is biased."""
+    so that the score is biased. A class says that it does not."""
     holds: ClassVar[tuple[str, ...]] = ()
     """the names of the fields with the moves that it runs; see `AbstractWrapper`."""
 
@@ -148,8 +153,6 @@ class FunctionMove(AbstractMove):
     """
 
     function: Callable[..., ParticleMixture]
-
-    approximate = True
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """What the function returns."""
@@ -215,6 +218,8 @@ class AbstractRegrouping(AbstractMove):
     mixture has the same distribution as the old one, whatever the new indicators are.
     """
 
+    approximate = False
+    biases_score = False
     weighs = False
     keeps_mass = True
 
@@ -280,6 +285,7 @@ class AbstractMarkovMove(AbstractMove):
     Weights, component indicators and ancestor indices stay, so that it is exact.
     """
 
+    approximate = False
     weighs = False
     keeps_mass = True
     keeps_families = False

@@ -56,6 +56,12 @@ class SelectInitial(AbstractMove):
     num_draws: Count = eqx.field(static=True, default=4)
     noise: Noise = eqx.field(static=True, default="independent")
 
+    approximate = False
+    keeps_families = False
+    """what it keeps are no independent draws."""
+    biases_score = False
+    """any ν is exact, so that its derivative is not needed."""
+
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` where no move draws x_1 of each x_0."""
         require_propagation(now, "x_0 is chosen")

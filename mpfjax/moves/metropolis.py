@@ -65,6 +65,11 @@ class AbstractMetropolis(AbstractMarkovMove):
     needs_parents = True
     """the target of x_t is given x_{t-1}."""
 
+    @property
+    def biases_score(self) -> bool:
+        """Whether derivatives do not see which moves are accepted."""
+        return self.gradient == "none"
+
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model without `log_transition`."""
         refuse_marginalised(now.model, type(self).__name__)

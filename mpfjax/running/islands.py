@@ -165,6 +165,8 @@ class IslandInteraction(AbstractMove):
 
     threshold: Share = eqx.field(static=True, default=0.5)
 
+    approximate = False
+    biases_score = False
     weighs = False
     keeps_mass = True
     """the observation changes no weight."""

@@ -30,8 +30,30 @@ _INDEPENDENT = {"scheme": "multinomial", "noise": "independent", "initial_noise"
 class _KeepEveIndices(AbstractMove):
     """Puts an `EveIndices` into the mixture of x_0, which `Resample` then keeps up to date."""
 
+    approximate = False
+    biases_score = False
     weighs = False
     keeps_mass = True
+
+    def check(self, now: Step, num_particles: int, num_components: int) -> None:
+        """Raise a `ValueError` for a chain of which the errors of one run are not known."""
+        check_keep_parents("filter", now.moves, "with_eve_indices")
+        moves = [move for move in now.initial_moves if move is not self] + list(now.moves)
+        for move in all_of(moves):
+            if move.approximate or not move.keeps_families:
+                name = type(move).__name__
+                raise ValueError(f"filter: {name} is approximate or draws in a way of its own")
+
+        # Draws that are more even than independent ones are not what the formulae are made of.
+        def draws(node: Any) -> bool:
+            return hasattr(node, "scheme") or hasattr(node, "noise")
+
+        for part in [now, *jax.tree.leaves(moves, is_leaf=draws)]:
+            for option, known in _INDEPENDENT.items():
+                chosen, name = getattr(part, option, known), type(part).__name__
+                if chosen != known:
+                    name = "the filter" if part is now else name
+                    raise ValueError(f"filter: {option} of {name} is {chosen!r}, not {known!r}")
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
@@ -53,21 +75,6 @@ def with_eve_indices(filter: Filter) -> Filter:
     `PropagateIndependently`, `PropagateInClusters` or `IslandInteraction`), and for draws that are
     not independent: a scheme other than "multinomial", or a noise other than "independent".
     """
-    check_keep_parents("filter", filter.moves, "with_eve_indices")
-    for move in all_of(filter.moves):
-        if move.approximate or not move.keeps_families:
-            name = type(move).__name__
-            raise ValueError(f"filter: {name} is approximate or draws in a way of its own")
-
-    # Draws that are more even than independent ones are not what the formulae are made of.
-    def draws(node: Any) -> bool:
-        return hasattr(node, "scheme") or hasattr(node, "noise")
-
-    for part in [filter, *jax.tree.leaves(filter.moves, is_leaf=draws)]:
-        for option, known in _INDEPENDENT.items():
-            chosen, name = getattr(part, option, known), type(part).__name__
-            if chosen != known:
-                raise ValueError(f"filter: {option} of {name} is {chosen!r}, not {known!r}")
     if any(isinstance(move, _KeepEveIndices) for move in filter.initial_moves):
         return filter
     kept = [move for move in filter.initial_moves if not move.weighs]

@@ -83,6 +83,9 @@ MOVES: dict[str, Callable[[Any], Filter]] = {
     "MetropolisAdjustedLangevin": chain(
         Propagate(), Resample(), mpfjax.MetropolisAdjustedLangevin()
     ),
+    "Metropolis beside stop": chain(
+        Propagate(gradient="stop"), Resample(gradient="stop"), mpfjax.RandomWalkMetropolis()
+    ),
     "Merge, Split": chain(Resample(), Propagate(), Merge(), Split()),
     "Prune": chain(Resample(), Propagate(), Prune(0.2)),
     "Pool": chain(Resample(), Propagate(), Pool()),

@@ -28,6 +28,9 @@ class Draw(AbstractPropagation):
     gradient: Gradient = eqx.field(static=True, default="none", kw_only=True)
     noise: Noise = eqx.field(static=True, default="independent", kw_only=True)
 
+    approximate = False
+    biases_score = False
+
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model that lacks what the arguments need."""
         model, proposal, needs_noise = now.model, self.proposal, self.noise != "independent"
@@ -120,6 +123,9 @@ class Reweight(AbstractPropagation):
 
     Use it after `Predict` and what a chain does to the prediction.
     """
+
+    approximate = False
+    biases_score = False
 
     def around(self, reference: Any) -> "Reweight":
         """The move itself, which weighs the trajectory as any other."""

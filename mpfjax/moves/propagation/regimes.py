@@ -107,6 +107,8 @@ class PropagateRegimes(AbstractPropagation):
 
     regroup: GroupBy | None = None
 
+    approximate = False
+    biases_score = False
     keeps_families = False
     """it resamples without a memory of Eve indices."""
 

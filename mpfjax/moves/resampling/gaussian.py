@@ -51,6 +51,13 @@ class GaussianRegeneration(AbstractResampling):
 
     approximate = True
     """each component is replaced by a Gaussian."""
+
+    @property
+    def biases_score(self) -> bool:
+        """Whether a part of the state is copied, which derivatives do not see; draws are made of
+        moments, which they do."""
+        return self.where is not None
+
     keeps_parents = False
     """a draw of a Gaussian comes from all particles of its component."""
 

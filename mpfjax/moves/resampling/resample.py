@@ -86,6 +86,8 @@ class Resample(AbstractResampling):
         if self.group is not None and self.particles_per_component is not None:
             raise ValueError("group: groups have no effect beside particles_per_component")
 
+    approximate = False
+
     @property
     def biases_score(self) -> bool:
         """Whether it may resample, and without a gradient."""
