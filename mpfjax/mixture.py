@@ -13,7 +13,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int, PyTree, Shaped
 
 from mpfjax.checks import SHARES, as_numbers, checked, saying
-from mpfjax.operations.islands import excess_over_islands, island_index, num_islands
+from mpfjax.operations.islands import (
+    excess_over_islands,
+    island_index,
+    num_islands,
+    sum_over_islands,
+)
 from mpfjax.operations.logarithms import (
     as_inexact,
     default_float,
@@ -278,10 +283,11 @@ class ParticleMixture(eqx.Module):
 
         Of what goes round it is the mean on the circle, as for `component_means`.
         """
-        means = _averages(self.average, self.particles, self.periods)
+        mass = jnp.exp(self.log_mass) if num_islands() > 1 else None
+        means = _averages(self.average, self.particles, self.periods, mass)
         if not isinstance(means, MarginalisedState):
             return means
-        centred = self.particles.mean - means.mean[None]
+        centred = self.particles.mean - sum_over_islands(means.mean)[None]
         between = self.average(centred[:, :, None] * centred[:, None, :])
         return means._replace(covariance=means.covariance + between)
 
@@ -305,7 +311,8 @@ class ParticleMixture(eqx.Module):
         It is about the mean: E[v²] - E[v]² would be rounding alone where v is far from zero.
         """
         values = _numbers(values)
-        return self.average(jnp.abs(values - self.average(values)[None]) ** 2)
+        mean = sum_over_islands(self.average(values))
+        return self.average(jnp.abs(values - mean[None]) ** 2)
 
     @checked
     def quantile(
@@ -496,20 +503,31 @@ def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
     return as_inexact(rows)
 
 
-def _averages(average: Callable[[Array], Array], values: PyTree, periods: PyTree) -> PyTree:
-    """The averages of the values, leaf by leaf, on a circle where there is a period."""
+def _averages(
+    average: Callable[[Array], Array],
+    values: PyTree,
+    periods: PyTree,
+    mass: Float[Array, ""] | None = None,
+) -> PyTree:
+    """The averages of the values, leaf by leaf, on a circle where there is a period.
+
+    With the `mass` of one island, what sums to the average over all of them.
+    """
     if periods is None:
         return jax.tree.map(average, values)
     if isinstance(values, MarginalisedState):
-        latent, mean = _averages(average, points(values), points(periods))
+        latent, mean = _averages(average, points(values), points(periods), mass)
         return MarginalisedState(latent, mean, average(values.covariance))
 
     def on_circle(values: Array, period: ArrayLike) -> Array:
         mean, period = average(values), jnp.asarray(period)
         scale = jnp.where(period > 0, period, 1.0) / (2 * jnp.pi)
         angles = values / jnp.broadcast_to(scale, values.shape)
-        angle = jnp.arctan2(average(jnp.sin(angles)), average(jnp.cos(angles)))
-        angle = angle * jnp.broadcast_to(scale, mean.shape)
+        sine, cosine = average(jnp.sin(angles)), average(jnp.cos(angles))
+        if mass is not None:
+            sine, cosine = sum_over_islands(sine), sum_over_islands(cosine)
+        angle = jnp.arctan2(sine, cosine) * jnp.broadcast_to(scale, mean.shape)
+        angle = angle if mass is None else angle * mass.astype(angle.dtype)
         return jnp.where(jnp.broadcast_to(period > 0, mean.shape), angle, mean)
 
     with saying("periods", "in the form of one state"):

@@ -23,6 +23,11 @@ def num_islands() -> int:
         return 1
 
 
+def sum_over_islands(value: Array) -> Array:
+    """The sum over all islands of what each has; the value itself where there is one."""
+    return value if num_islands() == 1 else jax.lax.psum(value, (ISLAND_AXIS, DEVICE_AXIS))
+
+
 def island_index() -> Int[Array, ""]:
     """The index of this island, from 0. Only inside `run_islands`."""
     first = jax.lax.axis_index(DEVICE_AXIS) * jax.lax.psum(1, ISLAND_AXIS)

@@ -61,8 +61,8 @@ def run_islands(
     - `devices`: a number or a sequence of `jax.devices()`, whose number must divide G. None takes
       the largest number of devices that divides G.
     - `collect(mixture)` sees one island, whose weights sum to its mass. Its results are stacked
-      over t and islands, (t, G, ...). The sum over islands of a weighted sum, such as
-      `mixture.mean()`, is that of the whole mixture.
+      over t and islands, (t, G, ...). The sum over islands of `average`, `mean` or `variance` is
+      that of the whole mixture.
 
     The result is that of `run_filter` on the whole mixture. Slots and component labels of island g
     come after those of island g - 1, ancestors may be on other islands, and only `memory` keeps a
