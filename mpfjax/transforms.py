@@ -127,12 +127,13 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
 def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter:
     """The filter that resamples by its weights times a look-ahead ν to y_t: `AuxiliaryResample`.
 
-    `lookahead` is that of the move; None is a `PilotLookahead`, which takes the model alone. One
-    that is a proposal also draws x_t, where the filter has no other. Raises `ValueError` for a
-    filter without `Resample`.
+    `lookahead` is that of the move; None is the filter's own proposal where that has a
+    `log_normaliser`, and else a `PilotLookahead`, which takes the model alone. One that is a
+    proposal also draws x_t, where the filter has no other. Raises `ValueError` for a filter
+    without `Resample`.
     """
     plain = _map_kind(filter, AuxiliaryResample, lambda move: move.resample)
-    look = PilotLookahead() if lookahead is None else lookahead
+    look = _own_lookahead(plain) if lookahead is None else lookahead
     _require_resample(plain, "which could look ahead")
 
     def guided(move: Propagate) -> Propagate:
@@ -140,6 +141,13 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
 
     ahead = _map_kind(plain, Resample, lambda move: AuxiliaryResample(move, look))
     return _map_kind(ahead, Propagate, guided) if isinstance(look, AbstractProposal) else ahead
+
+
+def _own_lookahead(filter: Filter) -> Lookahead:
+    """The look-ahead of the proposal by which the filter draws x_t, or of the model alone."""
+    proposals = [getattr(move, "proposal", None) for move in all_of(filter.moves)]
+    known = [proposal for proposal in proposals if hasattr(proposal, "log_normaliser")]
+    return known[0] if known else PilotLookahead()
 
 
 @checked

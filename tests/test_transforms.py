@@ -93,6 +93,8 @@ def test_a_look_ahead_and_proposals_are_put_on_and_taken_off():
     assert isinstance(ahead.moves[0], AuxiliaryResample)
     assert isinstance(ahead.moves[1].proposal, mpfjax.GaussNewtonProposal)
     assert isinstance(with_lookahead(plain).moves[0].lookahead, PilotLookahead)
+    guided = mpfjax.particle_filter(MODEL, 16, proposal=guide)
+    chex.assert_trees_all_equal(final(with_lookahead(guided)), final(ahead))
     several = with_proposals_per_particle(plain, 4)
     assert isinstance(several.moves[1], PropagateNested)
     assert with_proposals_per_particle(several, 8).moves[1].num_draws == 8
