@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.checks import checked
-from mpfjax.mixture import ParticleMixture
+from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.observations import refused_where
 from mpfjax.operations.stored import count_places, take
 from mpfjax.running.scan import FilterRun
@@ -58,10 +58,12 @@ def ancestors_of(particles: Int[Array, " k"], mixtures: ParticleMixture) -> Int[
 
 
 def paths_through(mixtures: ParticleMixture, indices: Int[Array, "t k"]) -> PyTree:
-    """The states in these slots, leaves (k, t, ...)."""
+    """The states in these slots, leaves (k, t, ...); latents of particles that carry moments."""
 
     def states(mixture: ParticleMixture, slots: Int[Array, " k"]) -> PyTree:
-        return jax.tree.map(lambda leaf: take(leaf, slots), mixture.particles)
+        states = mixture.particles
+        states = states.latent if isinstance(states, MarginalisedState) else states
+        return jax.tree.map(lambda leaf: take(leaf, slots), states)
 
     return jax.vmap(states, out_axes=1)(mixtures, indices)
 
@@ -71,7 +73,8 @@ class Genealogy(eqx.Module):
 
     - `indices`: (t, n), the slot of each particle's ancestor; at the end its own.
     - `trajectories`: leaves (n, t, ...), the states of the ancestors: a genealogical trajectory has
-      the weight of its particle in the final mixture.
+      the weight of its particle in the final mixture. Of a conditionally linear model these are the
+      latents, since the moments of an ancestor are those of filtering.
     - `share_apart`: (m, t), the number of distinct ancestors of each component's particles, divided
       by the number of particles: 1 where all are distinct, 1/count where one is left, and zero for
       a dead component.

@@ -4,6 +4,9 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
 import mpfjax
 from mpfjax import (
     Every,
@@ -39,6 +42,21 @@ def chain(*moves, m=M):
 
 def recipe(name, *sizes, **options):
     return lambda model: getattr(mpfjax, name)(model, N, *sizes, **options)
+
+
+def side(states):
+    """On which side of zero the first number of the state is."""
+    leaf = jax.tree.leaves(states)[-1]
+    return (leaf.reshape(len(leaf), -1)[:, 0] > 0).astype(jnp.int32)
+
+
+def identity(key, mixture, now):
+    return mixture
+
+
+def shifted(key, mixture, now):
+    """An initial move of one's own that is wrong."""
+    return mixture.replace(log_weights=mixture.log_weights - 1.0)
 
 
 GAUSS = GaussNewtonProposal()
@@ -89,9 +107,7 @@ MOVES: dict[str, Callable[[Any], Filter]] = {
     "Merge, Split": chain(Resample(), Propagate(), Merge(), Split()),
     "Prune": chain(Resample(), Propagate(), Prune(0.2)),
     "Pool": chain(Resample(), Propagate(), Pool()),
-    "GroupBy": chain(
-        Resample(), Propagate(), mpfjax.GroupBy(lambda states: (states > 0).astype(int))
-    ),
+    "GroupBy": chain(Resample(), Propagate(), mpfjax.GroupBy(side)),
     "Every": chain(Every(2, [Resample()]), Propagate()),
     "IslandInteraction": chain(mpfjax.IslandInteraction(), Resample(), Propagate()),
     "Exclusion": chain(Resample(), Propagate(), mpfjax.Exclusion(strength=1.0, radius=0.5)),
@@ -103,15 +119,6 @@ MOVES: dict[str, Callable[[Any], Filter]] = {
         model, [Resample(), Propagate()], N, initial_moves=[shifted]
     ),
 }
-
-
-def identity(key, mixture, now):
-    return mixture
-
-
-def shifted(key, mixture, now):
-    """An initial move of one's own that is wrong."""
-    return mixture.replace(log_weights=mixture.log_weights - 1.0)
 
 
 def with_one(name):
@@ -135,10 +142,10 @@ OF_OTHER_EVIDENCE = ("Bernoulli",)
 
 
 def parts(name: str) -> frozenset[str]:
-    """What a filter is made of: the names of its transforms, or its own."""
+    """What a filter is made of: its transforms, and itself."""
     if not name.startswith("with "):
         return frozenset({name, *OTHER_PARTS.get(name, ())})
-    return frozenset(name.removeprefix("with ").split(" > "))
+    return frozenset({name, *name.removeprefix("with ").split(" > ")})
 
 
-OTHER_PARTS = {"mixture rqmc": ("point sets", "look-ahead"), "mixture": ("selected start",)}
+OTHER_PARTS = {"mixture rqmc": ("point sets",)}

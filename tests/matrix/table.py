@@ -6,8 +6,7 @@ recipe, the transforms and the moves that it is made of.
 
 from typing import NamedTuple
 
-from tests.matrix.data import FOR
-from tests.matrix.filters import FILTERS, MOVES, RECIPES, TRANSFORMS, parts
+from tests.matrix.filters import parts
 from tests.matrix.models import FORMS
 
 Names = frozenset[str] | None
@@ -50,38 +49,81 @@ def but(all_names, *names: str) -> frozenset[str]:
 
 
 LINEAR = these("conditionally linear", "mixed", "switching")
+WITH_MEANS = these("made of noise", "per particle", "inputs", "matrices by step", "periodic")
 OF_OBJECTS = these(
     "partitioned", "distributed", "distributed, evidence", "independent", "clustered"
 )
-GAUSSIAN = these("Gaussian", "Gaussian, predictive", "Gaussian mixture")
-METROPOLIS = these("RandomWalkMetropolis", "MetropolisAdjustedLangevin")
-WHOLE_STATE = GAUSSIAN | METROPOLIS | these("look-ahead", "PropagateTempered")
+GAUSSIAN = these("Gaussian", "Gaussian, predictive", "Gaussian mixture", "initially Gaussian")
+METROPOLIS = these("RandomWalkMetropolis", "MetropolisAdjustedLangevin", "Metropolis beside stop")
 OF_NOISE = these("point sets", "look-ahead", "PropagateTempered")
-BACKWARD = these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "conditional filter")
+# What asks for the density of a step.
+OF_DENSITY = these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "score", "Gibbs",
+                   "conditional filter")  # fmt: skip
+OF_STATES = these("trajectories, mcmc", "sums", "sums, mcmc", "conditional filter", "Gibbs",
+                  "Gibbs, draw")  # fmt: skip
+OF_PARENTS = these("genealogy", "trajectories, mcmc", "sums, mcmc")
+OF_PATHS = these("conditional filter", "Gibbs", "Gibbs, draw")
+UNBIASED = these("Metropolis", "SMC²")
+JOINT = these("independent", "clustered")
+APPROXIMATE = GAUSSIAN | these("distributed", "Bernoulli", "Prune", "Exclusion", "own function",
+                               "initially own function")  # fmt: skip
+# Draws of these are not seen by derivatives.
+UNSEEN = JOINT | these("two draws", "PropagateNested", "PropagateTempered", "Prune", "Exclusion",
+                       "own function", "initially own function", "Bernoulli")  # fmt: skip
 RULES = (
-    Rule("is not a MultiObjectModel|independent copies", "filters of several objects need a `MultiObjectModel`",
+    Rule("MultiObjectModel", "filters of several objects are for a `MultiObjectModel`",
          forms=but(FORMS, "one of several"), filters=OF_OBJECTS),
-    Rule("is not a TargetsModel", "`bernoulli_filter` needs a `TargetsModel`",
+    Rule("TargetsModel", "`bernoulli_filter` is for a `TargetsModel`",
          forms=but(FORMS, "targets"), filters=these("Bernoulli")),
-    Rule("transition_mean|observation_mean", "`GaussNewtonProposal` needs means and covariances of the model",
-         forms=but(FORMS, "made of noise", "per particle", "inputs", "matrices by step", "periodic"),
-         filters=these("guided", "auxiliary")),
-    Rule("transition_from_noise", "point sets, `PilotLookahead` and tempering need `transition_from_noise`",
+    Rule("transition_mean|observation_mean",
+         "`GaussNewtonProposal` needs the model's means and covariances",
+         forms=but(FORMS, *WITH_MEANS), filters=these("guided", "auxiliary")),
+    Rule("transition_from_noise",
+         "point sets, `PilotLookahead` and `PropagateTempered` need `transition_from_noise`",
          forms=these("three methods", "whole numbers"), filters=OF_NOISE),
-    Rule("log_transition", "gradient \"stop\", Metropolis moves and backward sampling need `log_transition`",
+    Rule("log_transition",
+         'gradient "stop", Metropolis moves and backward sampling need `log_transition`',
          forms=these("three methods"), filters=METROPOLIS | these("score")),
-    Rule("log_transition", "", forms=these("three methods"), questions=BACKWARD | these("score", "Gibbs")),
-    Rule("conditionally linear", "moves and smoothers that need a state drawn as a whole refuse a conditionally linear model",
-         forms=LINEAR, filters=WHOLE_STATE),
-    Rule("conditionally linear|by 'exact'", "", forms=LINEAR,
-         questions=these("trajectories, mcmc", "sums", "sums, mcmc", "conditional filter", "Gibbs", "Gibbs, draw")),
-    Rule("all_transitions|AbstractConditionallyLinear", "`PropagateRegimes` needs finitely many latents",
+    Rule("log_transition", "", forms=these("three methods"), questions=OF_DENSITY),
+    Rule("all_transitions|AbstractConditionallyLinear",
+         "`PropagateRegimes` needs a latent with finitely many values",
          forms=but(FORMS, "switching"), filters=these("PropagateRegimes")),
-    Rule("floating point", "a Gaussian has no whole numbers", forms=these("whole numbers", "tree"), filters=GAUSSIAN | these("initially Gaussian")),
-    Rule("which draw is kept", "`with_proposals_per_particle` has no score", together=these("two draws", "score")),
-    Rule("scheme|noise|families|Eve|SelectInitial", "Eve indices need independent multinomial draws and no choice of x_0",
+    Rule("conditionally linear",
+         "Gaussian filters, `PilotLookahead`, `PropagateTempered`, Metropolis moves, PaRIS and "
+         "conditional SMC need states that are drawn as a whole: no conditionally linear model",
+         forms=LINEAR, filters=GAUSSIAN | METROPOLIS | these("look-ahead", "PropagateTempered")),
+    Rule("conditionally linear|by 'exact'", "", forms=LINEAR, questions=OF_STATES),
+    Rule("floating point", "a Gaussian has no whole numbers: `where` leaves them out",
+         forms=these("tree", "whole numbers"), filters=GAUSSIAN),
+    Rule("which draw is kept|derivatives do not see",
+         "`with_score_gradient` refuses moves whose draws a derivative does not see "
+         "(`biases_score`): several proposals a particle, tempering, filters of separate objects",
+         together=these("two draws", "score")),
+    Rule("which draw is kept|derivatives do not see", "", filters=UNSEEN, questions=these("score")),
+    Rule("initial_noise|noise of|scheme of|draws in a way",
+         "the errors of one run (`with_eve_indices`) are for independent draws: no point sets, "
+         "other schemes than multinomial, several proposals, or choice of x_0",
          together=these("families", "point sets")),
-    Rule("nearly all weight|hardly any draw|degenerate", "a prior 100 000 standard deviations of the likelihood wide is warned of",
+    Rule("scheme of", "", filters=these("with families > stratified")),
+    Rule("draws in a way", "", filters=these("with families > selected start")),
+    Rule("single|one parent|ancestors",
+         "genealogies, and the methods \"mcmc\" of smoothers, need single ancestors: no Gaussian "
+         "regeneration, islands or filters of separate objects",
+         filters=GAUSSIAN | JOINT | these("IslandInteraction"), questions=OF_PARENTS),
+    Rule("cannot keep a trajectory|independent|one Propagate|approximate",
+         "conditional SMC and particle Gibbs take `Resample`, `Propagate` and regrouping alone",
+         filters=GAUSSIAN | OF_OBJECTS | METROPOLIS
+         | these("point sets", "two draws", "PropagateNested", "PropagateTempered", "Bernoulli",
+                 "PropagateRegimes", "own function", "Prune", "Exclusion"),
+         questions=OF_PATHS),
+    Rule("unbiased likelihood",
+         "`metropolis_hastings` and `smc2` take no filter that is `approximate`",
+         filters=APPROXIMATE, questions=UNBIASED),
+    Rule("slots", "filters of separate objects need every slot", filters=JOINT,
+         questions=these("slots")),
+    Rule("nearly all weight|hardly any draw|degenerate",
+         "a prior 100 000 standard deviations of the likelihood wide is warned of; a conditionally "
+         "linear model is exact",
          data=these("wide prior"), forms=but(FORMS, *LINEAR), warns=True),
 )  # fmt: skip
 # Rewritten at this moment: taken in with what they rest on.
@@ -91,6 +133,3 @@ AFTER_START = these("start", "restarts")
 def rules_of(form, data, filter, question):
     """The rules of a cell; it is right if there is none."""
     return [rule for rule in RULES if rule.holds(form, data, filter, question)]
-
-
-__all__ = ["AFTER_START", "FILTERS", "FOR", "MOVES", "RECIPES", "RULES", "TRANSFORMS", "rules_of"]

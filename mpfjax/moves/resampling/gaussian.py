@@ -11,6 +11,7 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
+from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.noise import draw_noise
 from mpfjax.moves.base import AbstractResampling, Step
 from mpfjax.moves.regrouping.features import origin, summarise
@@ -62,7 +63,9 @@ class GaussianRegeneration(AbstractResampling):
     """a draw of a Gaussian comes from all particles of its component."""
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
-        """Raise a `ValueError` for fewer slots than each component is to have."""
+        """Raise a `ValueError` for too few slots, and for particles that carry moments."""
+        if self.where is None:
+            refuse_marginalised(now.model, "GaussianRegeneration", "take Resample")
         self._resample.check(now, num_particles, num_components)
 
     def resample(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
