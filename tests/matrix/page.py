@@ -10,15 +10,17 @@ from tests.matrix.table import AFTER_START, APPROXIMATE, RULES, UNSEEN, rules_of
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "compatibility.md"
 TEXT = """# What works with what
 
-One linear Gaussian law, whose exact answers a Kalman filter gives in float64, is written in every form in which a model can be
-written. The tests put every form, every kind of data, every filter and every question together (`tests/matrix/`). Each number
-is within four standard errors of the exact one, or the call is refused with a `ValueError`, or a warning says that the number
-cannot be trusted. This page is made from the table of the tests, by `python -m tests.matrix.page`.
+One linear Gaussian law, whose exact answers a Kalman filter gives in float64, is written in
+every form in which a model can be written. The tests put every form, every kind of data, every
+filter and every question together (`tests/matrix/`). Each number is within four standard errors
+of the exact one, or the call is refused with a `ValueError`, or a warning says that the number
+cannot be trusted. This page is made from the table of the tests, by `python -m
+tests.matrix.page`.
 
 - Models: {forms}.
-- Data: complete; missing by NaN, by `present=` with absurd placeholders, or left to the model (`handles_missing`); each
-  log-likelihood a million higher or lower; units a thousand times as large or small; a step of zero likelihood; a very diffuse
-  prior.
+- Data: complete; missing by NaN, by `present=` with absurd placeholders, or left to the model
+  (`handles_missing`); each log-likelihood a million higher or lower; units a thousand times as
+  large or small; a step of zero likelihood; a very diffuse prior.
 - Filters: {recipes}; all transforms and all pairs of transforms; {moves}.
 - Questions: {questions}.
 
@@ -26,7 +28,8 @@ cannot be trusted. This page is made from the table of the tests, by `python -m 
 
 {refused}
 
-Of a model that has nothing but the three methods, {bare} are refused. Of conditionally linear models, {linear}.
+Of a model that has nothing but the three methods, {bare} are refused. Of conditionally linear
+models, {linear}.
 
 ## Pairs of transforms
 
@@ -34,9 +37,10 @@ All pairs of {transforms} work in either order, except {pairs}.
 
 ## What a filter says of itself
 
-- `filter.approximate`: {approximate}. $\\log \\hat{{Z}}$ of all others is that of an unbiased estimate.
-- A move's `biases_score`: {unseen}, besides any resampling without `with_score_gradient`. Derivatives of
-  $\\log \\hat{{Z}}$ are an unbiased estimate of the score with all others.
+- `filter.approximate`: {approximate}. $\\log \\hat{{Z}}$ of all others is that of an unbiased
+  estimate.
+- A move's `biases_score`: {unseen}, besides any resampling without `with_score_gradient`.
+  Derivatives of $\\log \\hat{{Z}}$ are an unbiased estimate of the score with all others.
 
 Both are true of a move of your own unless its class says otherwise.
 """

@@ -1,4 +1,4 @@
-"""What is refused, or warned of, where two mechanisms meet: all other cells of the matrix are right.
+"""What is refused or warned of where mechanisms meet: all other cells of the matrix are right.
 
 A rule holds for the cells that are in all of its sets; None is every name. A filter counts by the
 recipe, the transforms and the moves that it is made of.
