@@ -44,6 +44,8 @@ class PropagateTempered(AbstractPropagation, AbstractWrapper):
     exponents: tuple[float, ...] = eqx.field(static=True, default=(1 / 64, 1 / 16, 1 / 4, 1.0))
 
     holds = ("resample",)
+    biases_score = True
+    """a derivative does not see which moves are accepted."""
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model that does not make x_t of noise."""

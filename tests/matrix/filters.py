@@ -17,7 +17,6 @@ from mpfjax import (
     Pool,
     Propagate,
     PropagateNested,
-    PropagateTempered,
     Prune,
     RandomPartition,
     Resample,
@@ -95,15 +94,12 @@ TRANSFORMS: dict[str, Callable[[Filter], Filter]] = {
 MOVES: dict[str, Callable[[Any], Filter]] = {
     "Predict, Reweight": chain(Resample(), Predict(), Reweight()),
     "PropagateNested": chain(Resample(), PropagateNested(Propagate(), 3)),
-    "PropagateTempered": chain(Resample(), PropagateTempered()),
     "PropagateRegimes": chain(Resample(), mpfjax.PropagateRegimes()),
     "RandomWalkMetropolis": chain(Propagate(), Resample(), mpfjax.RandomWalkMetropolis()),
-    "MetropolisAdjustedLangevin": chain(
-        Propagate(), Resample(), mpfjax.MetropolisAdjustedLangevin()
-    ),
     "Metropolis beside stop": chain(
         Propagate(gradient="stop"), Resample(gradient="stop"), mpfjax.RandomWalkMetropolis()
     ),
+    "pathwise": chain(Resample(gradient="stop"), Propagate()),
     "Merge, Split": chain(Resample(), Propagate(), Merge(), Split()),
     "Prune": chain(Resample(), Propagate(), Prune(0.2)),
     "Pool": chain(Resample(), Propagate(), Pool()),

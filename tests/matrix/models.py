@@ -1,5 +1,6 @@
 """The law in all the forms in which a user can write it."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -112,6 +113,10 @@ class OfOne(eqx.Module):
     model: OfNoise
     inputs: Any = None
 
+    @property
+    def own(self):
+        return dataclasses.replace(self.model, inputs=self.inputs)
+
     def __getattr__(self, name):
         if name in ("law", "handles_missing", "noise_dimension", "initial_noise_dimension",
                     "transition_covariance", "observation_covariance"):  # fmt: skip
@@ -119,28 +124,28 @@ class OfOne(eqx.Module):
         raise AttributeError(name)
 
     def sample_initial(self, key):
-        return self.model.sample_initial(key, 1)[0]
+        return self.own.sample_initial(key, 1)[0]
 
     def initial_from_noise(self, noise):
-        return self.model.initial_from_noise(noise[None])[0]
+        return self.own.initial_from_noise(noise[None])[0]
 
     def transition_from_noise(self, noise, state):
-        return self.model.transition_from_noise(noise[None], state[None])[0]
+        return self.own.transition_from_noise(noise[None], state[None])[0]
 
     def log_initial(self, state):
-        return self.model.log_initial(state)
+        return self.own.log_initial(state)
 
     def log_transition(self, state, previous_state):
-        return self.model.log_transition(state, previous_state)
+        return self.own.log_transition(state, previous_state)
 
     def log_likelihood(self, observation, state):
-        return self.model.log_likelihood(observation, state)
+        return self.own.log_likelihood(observation, state)
 
     def transition_mean(self, state):
-        return self.model.transition_mean(state)
+        return self.own.transition_mean(state)
 
     def observation_mean(self, state):
-        return self.model.observation_mean(state)
+        return self.own.observation_mean(state)
 
 
 class GoingRound(OfNoise):
@@ -235,6 +240,11 @@ class Steps(mpfjax.AbstractStateSpaceModel):
 
     def log_initial(self, states):
         return jnp.full(states.shape, jnp.log(0.2))
+
+
+def by_step(law, u):
+    """u_t as the known inputs."""
+    return np.asarray(u, np.float32)
 
 
 def matrix_of(value):
@@ -334,19 +344,20 @@ FORMS: dict[str, Form] = {
     "per particle": Form(
         lambda law, **options: mpfjax.per_particle(OfOne(OfNoise(law, **options))),
         offset=lambda model: model.model.model.law.c,
+        inputs=by_step,
     ),
-    "inputs": Form(own(OfNoise), inputs=lambda law, u: np.asarray(u, np.float32)),
+    "inputs": Form(own(OfNoise), inputs=by_step),
     "matrices by step": Form(
         linear, rows=True, inputs=matrices_by_step, data="plain", offset=None
     ),
     "conditionally linear": Form(
-        own(Conditionally), inputs=lambda law, u: np.asarray(u, np.float32), data="parts", **MOMENTS
+        own(Conditionally), inputs=by_step, data="parts", **MOMENTS
     ),
     "mixed": Form(own(Mixed), data="parts", **MOMENTS),
     "switching": Form(switching, data="plain", offset=lambda model: model.c, **MOMENTS),
     "one of several": Form(
         lambda law, **options: mpfjax.MultiObjectModel(OfNoise(law, **options), 1),
-        rows=True, offset=lambda model: model.object_model.law.c,
+        rows=True, inputs=by_step, offset=lambda model: model.object_model.law.c,
     ),
     "cluttered": Form(
         cluttered, rows=True, data="sets", offset=lambda model: model.object_model.law.c

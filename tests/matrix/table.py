@@ -54,8 +54,8 @@ OF_OBJECTS = these(
     "partitioned", "distributed", "distributed, evidence", "independent", "clustered"
 )
 GAUSSIAN = these("Gaussian", "Gaussian, predictive", "Gaussian mixture", "initially Gaussian")
-METROPOLIS = these("RandomWalkMetropolis", "MetropolisAdjustedLangevin", "Metropolis beside stop")
-OF_NOISE = these("point sets", "look-ahead", "PropagateTempered")
+METROPOLIS = these("RandomWalkMetropolis", "Metropolis beside stop")
+OF_NOISE = these("point sets", "look-ahead")
 # What asks for the density of a step.
 OF_DENSITY = these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "score", "Gibbs",
                    "conditional filter")  # fmt: skip
@@ -68,7 +68,7 @@ JOINT = these("independent", "clustered")
 APPROXIMATE = GAUSSIAN | these("distributed", "Bernoulli", "Prune", "Exclusion", "own function",
                                "initially own function")  # fmt: skip
 # Draws of these are not seen by derivatives.
-UNSEEN = JOINT | these("two draws", "PropagateNested", "PropagateTempered", "Prune", "Exclusion",
+UNSEEN = JOINT | these("two draws", "PropagateNested", "Prune", "Exclusion",
                        "own function", "initially own function", "Bernoulli")  # fmt: skip
 RULES = (
     Rule("MultiObjectModel", "filters of several objects are for a `MultiObjectModel`",
@@ -79,7 +79,7 @@ RULES = (
          "`GaussNewtonProposal` needs the model's means and covariances",
          forms=but(FORMS, *WITH_MEANS), filters=these("guided", "auxiliary")),
     Rule("transition_from_noise",
-         "point sets, `PilotLookahead` and `PropagateTempered` need `transition_from_noise`",
+         "point sets and `PilotLookahead` need `transition_from_noise`",
          forms=these("three methods", "whole numbers"), filters=OF_NOISE),
     Rule("log_transition",
          'gradient "stop", Metropolis moves and backward sampling need `log_transition`',
@@ -89,15 +89,15 @@ RULES = (
          "`PropagateRegimes` needs a latent with finitely many values",
          forms=but(FORMS, "switching"), filters=these("PropagateRegimes")),
     Rule("conditionally linear",
-         "Gaussian filters, `PilotLookahead`, `PropagateTempered`, Metropolis moves, PaRIS and "
+         "Gaussian filters, `PilotLookahead`, Metropolis moves, PaRIS and "
          "conditional SMC need states that are drawn as a whole: no conditionally linear model",
-         forms=LINEAR, filters=GAUSSIAN | METROPOLIS | these("look-ahead", "PropagateTempered")),
+         forms=LINEAR, filters=GAUSSIAN | METROPOLIS | these("look-ahead")),
     Rule("conditionally linear|by 'exact'", "", forms=LINEAR, questions=OF_STATES),
     Rule("floating point", "a Gaussian has no whole numbers: `where` leaves them out",
          forms=these("tree", "whole numbers"), filters=GAUSSIAN),
     Rule("which draw is kept|derivatives do not see",
          "`with_score_gradient` refuses moves whose draws a derivative does not see "
-         "(`biases_score`): several proposals a particle, tempering, filters of separate objects",
+         "(`biases_score`): several proposals a particle, filters of separate objects",
          together=these("two draws", "score")),
     Rule("which draw is kept|derivatives do not see", "", filters=UNSEEN, questions=these("score")),
     Rule("initial_noise|noise of|scheme of|draws in a way",
@@ -113,7 +113,7 @@ RULES = (
     Rule("cannot keep a trajectory|independent|one Propagate|approximate",
          "conditional SMC and particle Gibbs take `Resample`, `Propagate` and regrouping alone",
          filters=GAUSSIAN | OF_OBJECTS | METROPOLIS
-         | these("point sets", "two draws", "PropagateNested", "PropagateTempered", "Bernoulli",
+         | these("point sets", "two draws", "PropagateNested", "Bernoulli",
                  "PropagateRegimes", "own function", "Prune", "Exclusion"),
          questions=OF_PATHS),
     Rule("unbiased likelihood",
@@ -126,8 +126,8 @@ RULES = (
          "linear model is exact",
          data=these("wide prior"), forms=but(FORMS, *LINEAR), warns=True),
 )  # fmt: skip
-# Rewritten at this moment: taken in with what they rest on.
-AFTER_START = these("start", "restarts")
+# Filters that are left out: none, since a start is a restart at step L.
+AFTER_START = these()
 
 
 def rules_of(form, data, filter, question):

@@ -1,4 +1,7 @@
-"""The scores of the filters: the derivatives of log Ẑ against those of the Kalman filter."""
+"""Derivatives of log Ẑ are the same in every mode, finite, and change no values.
+
+That they are the score, the matrix asks.
+"""
 
 import chex
 import equinox as eqx
@@ -9,103 +12,14 @@ import pytest
 
 import mpfjax
 from mpfjax import Filter, Propagate, Resample, Step, with_score_gradient
-from mpfjax.exact import kalman_filter
-from mpfjax.moves.propagation.propagate import Predict, Reweight
+from mpfjax.moves.propagation.propagate import Predict
 from tests.examples import example_mixtures
-from tests.marking import quick_of, weekly
-from tests.unbiased import assert_unbiased
+from tests.marking import weekly
 from tests.user_models import BLINDED, ScalarLinear
 
-NUM_PARTICLES, NUM_RUNS = 48, 1000
+NUM_PARTICLES = 48
 MODEL = ScalarLinear()
-TWO = jnp.array([[1.5, -0.4], [1.0, 0.3], [0.4, 1.2], [0.9, 0.8]])  # of two objects
-ONE = TWO[:, :1]
-
-
-def joint(make, **options):
-    return lambda model: make(mpfjax.MultiObjectModel(model, 2), NUM_PARTICLES, **options)
-
-
-def single(make, *sizes, **options):
-    return lambda model: make(model, NUM_PARTICLES, *sizes, **options)
-
-
-def guided(model):
-    proposal = mpfjax.GaussNewtonProposal()
-    return mpfjax.particle_filter(model, NUM_PARTICLES, proposal=proposal)
-
-
-def own(*moves):
-    return lambda model: Filter(model, moves, NUM_PARTICLES)
-
-
-RESAMPLE = Resample("multinomial", ess_threshold=0.5)
-
-
-def pathwise(model):
-    """Stop-gradient resampling of particles that are differentiated through their draws."""
-    return Filter(model, [Resample(gradient="stop"), Propagate()], NUM_PARTICLES)
-
-
-WITH_GAP = ONE.at[1].set(jnp.nan)
-# A filter, before its gradient is chosen, and the observations.
-FILTERS = {
-    "mpf": (single(mpfjax.mixture_particle_filter, 2, ess_threshold=0.7), ONE),
-    "pf": (single(mpfjax.particle_filter), ONE),
-    "mpf rqmc": (single(mpfjax.mixture_particle_filter, 2, noise="rqmc"), ONE),
-    "guided pf": (guided, ONE),
-    "pathwise": (pathwise, ONE),
-    "walk": (own(Propagate(), RESAMPLE, mpfjax.RandomWalkMetropolis()), ONE),
-    "halves, one missing": (own(RESAMPLE, Predict(), Reweight()), WITH_GAP),
-    "ps": (joint(mpfjax.partitioned_sampling, order=(1, 0)), TWO),
-    "dps": (
-        joint(
-            mpfjax.distributed_partitioned_sampling, reassembly="evidence"
-        ), TWO,
-    ),
-}  # fmt: skip
-
-
-def deviations(name, transform):
-    """How many standard errors E[Ẑ/Z ∇log Ẑ] is from the exact score, for every parameter."""
-    make, observations = FILTERS[name]
-
-    def log_evidence(model, key):
-        filter = transform(make(model))
-        seen = observations if filter.model is not model else observations[:, 0]
-        run = mpfjax.run_filter(key, filter, seen, lambda mixture: None, missing="skip")
-        return run.log_marginal_likelihood
-
-    def exact_log_evidence(model):
-        series = [mpfjax.Series.skipping(column[:, None]) for column in observations.T]
-        runs = [kalman_filter(model.in_matrices(), one) for one in series]
-        return sum(run.log_marginal_likelihood for run in runs)
-
-    score = eqx.filter_jit(jax.vmap(eqx.filter_value_and_grad(log_evidence), in_axes=(None, 0)))
-    logs, slopes = score(MODEL, jax.random.split(jax.random.key(0), NUM_RUNS))
-    exact, exact_slopes = eqx.filter_value_and_grad(exact_log_evidence)(MODEL)
-    ratios = np.exp(np.asarray(logs - exact, float))
-    assert_unbiased(ratios, loosest=0.04)
-    found = {}
-    for field in "aqhrmp":
-        values = ratios * np.asarray(getattr(slopes, field), float)
-        error = values.std() / np.sqrt(NUM_RUNS)
-        found[field] = float((values.mean() - getattr(exact_slopes, field)) / error)
-    return found
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize("name", quick_of(FILTERS, ["pf", "mpf"], one_in=8))
-def test_stop_gradient_scores_are_unbiased(name):
-    """∇Ẑ = Ẑ ∇log Ẑ is an unbiased estimate of ∇Z, for any number of particles."""
-    found = deviations(name, (lambda f: f) if name == "pathwise" else with_score_gradient)
-    assert max(map(abs, found.values())) < 4, found
-
-
-@pytest.mark.exactness
-def test_plain_derivatives_are_biased():
-    found = deviations("pf", lambda filter: filter)
-    assert max(map(abs, found.values())) > 10, found
+ONE = jnp.array([[1.5], [1.0], [0.4], [0.9]])
 
 
 MOVES = {

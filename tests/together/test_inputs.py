@@ -16,10 +16,6 @@ from jax.scipy.stats import norm
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
-from mpfjax.lookahead.pilot import AbstractLookahead
-from mpfjax.smoothing import sample_trajectories, smoothed_sums
-from tests.marking import quick_of
-from tests.unbiased import assert_unbiased, ratios_to
 
 TIMES = np.cumsum([0.3, 1.7, 0.2, 0.2, 2.5, 0.6]).astype(np.float32)
 INPUTS = {
@@ -75,22 +71,6 @@ class Driven(mpfjax.AbstractStateSpaceModel):
 
     def observation_mean(self, states):
         return states
-
-
-class DrivenOfOne:
-    """The same for one particle, by random walks; not even a module."""
-
-    inputs: Any = None
-
-    def sample_initial(self, key):
-        return jax.random.normal(key)
-
-    def sample_transition(self, key, state):
-        (state,) = Driven(inputs=self.inputs).sample_transition(key, state[None])
-        return state
-
-    def log_likelihood(self, observation, state):
-        return norm.logpdf(observation, state, ERROR)
 
 
 def in_matrices(gain=GAIN):
@@ -153,103 +133,9 @@ def test_the_references_take_controls_and_matrices_by_time():
     np.testing.assert_allclose(run.means, filtered, atol=1e-4)
 
 
-@pytest.mark.exactness
-def test_evidence_and_means_are_unbiased():
-    """E[Ẑ/Z] = 1 and E[Ẑ/Z E^[x_t]] = E[x_t | y_1..y_t], within 4 standard errors."""
-    filter, keys = mpfjax.particle_filter(Driven(), 48), jax.random.split(KEY, 2000)
-    run = mpfjax.monte_carlo(keys, filter, mpfjax.Series(OBSERVATIONS, INPUTS), mean)
-    log_z, filtered, _ = truth()
-    ratios = ratios_to(log_z, run)
-    assert_unbiased(ratios, loosest=0.04)
-    assert_unbiased(ratios * run.collected[:, -1], filtered[-1])
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize("method", ["trajectories", "sums"])
-def test_smoothed_means_are_those_of_the_joint_normal(method):
-    """Of every time, within 4 standard errors over the runs."""
-    filter, given = mpfjax.particle_filter(Driven(), 200), jax.tree.map(jnp.asarray, INPUTS)
-
-    def by_trajectories(key):
-        of_run, of_paths = jax.random.split(key)
-        run = mpfjax.run_filter(of_run, filter, OBSERVATIONS, inputs=given)
-        paths = sample_trajectories(of_paths, filter.model, run, 200, inputs=given)
-        return paths.mean(axis=0)
-
-    def by_sums(key):
-        # With a lag of the whole series, each term is smoothed by all observations.
-
-        def pair(before, after):
-            return jnp.stack([before, after], axis=1)
-
-        series = mpfjax.Series(OBSERVATIONS, given)
-        found = smoothed_sums(key, filter, series, pair, lag=LENGTH, method="exact")
-        return jnp.concatenate([found.terms[:1, 0], found.terms[:, 1]])
-
-    one = by_sums if method == "sums" else by_trajectories
-    keys = jax.random.split(jax.random.key(8), 120)
-    assert_unbiased(jax.lax.map(one, keys), truth()[2], loosest=0.01)
-
-
 def built_in(dt=0.5, u=1.0):
     """What every step sees where the inputs are constant."""
     return {"dt": jnp.asarray(dt), "u": jnp.asarray(u)}
-
-
-class LookAhead(AbstractLookahead):
-    """The likelihood of the mean, by the model at u_t."""
-
-    def log_factors(self, mixture, now):
-        mean = now.model.transition_mean(mixture.particles)
-        return now.model.log_likelihood(now.observation, mean)
-
-
-def of_objects(make):
-    def filter(inputs):
-        return make(mpfjax.MultiObjectModel(Driven(inputs=inputs), 2, shared_observation=True))
-
-    return filter
-
-
-def own_chain(*moves):
-    def filter(inputs):
-        return mpfjax.Filter(Driven(inputs=inputs), [mpfjax.Resample(), *moves], 32)
-
-    return filter
-
-
-EVERYWHERE = {
-    "guided mpf rqmc": lambda inputs: mpfjax.mixture_particle_filter(
-        Driven(inputs=inputs), 32, 2, noise="rqmc",
-        proposal=mpfjax.GaussNewtonProposal(),
-    ),
-    "look-ahead": lambda inputs: mpfjax.auxiliary_particle_filter(
-        Driven(inputs=inputs), 32, LookAhead()
-    ),
-    "families": own_chain(mpfjax.PropagateNested(mpfjax.Propagate(), 2)),
-    "a proposal": own_chain(mpfjax.Propagate(mpfjax.GaussNewtonProposal())),
-    "ps": of_objects(lambda joint: mpfjax.partitioned_sampling(joint, 32)),
-    "clusters": of_objects(
-        lambda joint: mpfjax.clustered_particle_filter(joint, 32, start="together")
-    ),
-}  # fmt: skip
-
-
-QUICK = ["a proposal"]
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize("name", quick_of(EVERYWHERE, QUICK, one_in=2))
-def test_every_move_sees_the_inputs(name):
-    """Inputs give the step of the model with them built in, and other inputs another one."""
-    make, y = EVERYWHERE[name], OBSERVATIONS[0]
-    filter = make(built_in())
-    before = filter.init(KEY)
-    expected, _ = filter.step(KEY, before, y)
-    given, _ = make(None).step(KEY, before, y, inputs=built_in())
-    np.testing.assert_allclose(given.mean(), expected.mean(), rtol=1e-5, atol=1e-6)
-    other, _ = make(None).step(KEY, before, y, inputs=built_in(u=2.0))
-    assert np.abs(other.mean() - given.mean()).min() > 1e-3
 
 
 class Drawn(mpfjax.AbstractStateSpaceModel):
@@ -332,12 +218,6 @@ def test_monte_carlo_islands_and_studies_hand_them_on(tmp_path):
     alone = mpfjax.run_filter(own, FILTER, OBSERVATIONS, nothing, inputs=INPUTS)
     found = island.log_marginal_likelihood, alone.log_marginal_likelihood
     np.testing.assert_allclose(*found, rtol=1e-5)
-
-
-@pytest.mark.exactness
-def test_a_model_of_one_particle():
-    found = run(filter=mpfjax.particle_filter(mpfjax.per_particle(DrivenOfOne()), 2000))
-    np.testing.assert_allclose(found.collected, truth()[1], atol=0.1)
 
 
 def test_nothing_compiles_again():

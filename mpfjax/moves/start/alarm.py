@@ -66,6 +66,8 @@ class WatchStart(AbstractMove):
 
     num_particles: Count = eqx.field(static=True, default=4096)
 
+    approximate = False
+    biases_score = False
     weighs = False
     keeps_mass = True
 
