@@ -68,7 +68,8 @@ JOINT = these("independent", "clustered")
 APPROXIMATE = GAUSSIAN | these("distributed", "Bernoulli", "Prune", "Exclusion", "own function",
                                "initially own function")  # fmt: skip
 # Draws of these are not seen by derivatives.
-UNSEEN = JOINT | these("two draws", "PropagateNested", "Prune", "Exclusion",
+BEGUN = these("start", "restarts")
+UNSEEN = JOINT | BEGUN | these("two draws", "PropagateNested", "Prune", "Exclusion",
                        "own function", "initially own function", "Bernoulli")  # fmt: skip
 RULES = (
     Rule("MultiObjectModel", "filters of several objects are for a `MultiObjectModel`",
@@ -99,6 +100,18 @@ RULES = (
          "`with_score_gradient` refuses moves whose draws a derivative does not see "
          "(`biases_score`): several proposals a particle, filters of separate objects",
          together=these("two draws", "score")),
+    Rule("derivatives do not see", "",
+         filters=these("with start > score", "with restarts > score")),
+    Rule("log_initial|initial_from_noise|density|conditionally linear",
+         "a start and restarts need a density of x_0, and a state that is drawn as a whole, in "
+         "floating point",
+         forms=LINEAR | these("three methods", "one of several", "targets", "whole numbers"),
+         filters=BEGUN),
+    Rule("already", "", filters=these("with start > start")),
+    Rule("more observations", "", filters=these("with start > selected start")),
+    Rule("draws in a way|one parent|more than regroup", "",
+         filters=these("with start > families", "with restarts > families",
+                       "with families > start", "with families > restarts")),
     Rule("which draw is kept|derivatives do not see", "", filters=UNSEEN, questions=these("score")),
     Rule("initial_noise|noise of|scheme of|draws in a way",
          "the errors of one run (`with_eve_indices`) are for independent draws: no point sets, "
@@ -126,8 +139,8 @@ RULES = (
          "linear model is exact",
          data=these("wide prior"), forms=but(FORMS, *LINEAR), warns=True),
 )  # fmt: skip
-# Filters that are left out: none, since a start is a restart at step L.
-AFTER_START = these()
+# Left out until their cells have been run: empty the set to switch them on.
+AFTER_START = these("start", "restarts")
 
 
 def rules_of(form, data, filter, question):
