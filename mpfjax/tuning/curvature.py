@@ -57,24 +57,34 @@ def standard_errors(
     problem = pose_evidence(filter, observations, parameters, transforms)
     warn_of_bias("standard_errors", problem)
     batches = [jax.random.split(key, num_seeds)]
-    return errors_at(problem, problem.start(), batches, "num_seeds")
+    return errors_at([problem], problem.start(), batches, "num_seeds")
 
 
 def errors_at(
-    problem: Problem, reals: Reals, batches: list[Key[Array, " seeds"]], of_seeds: str
+    problems: list[Problem], reals: Reals, batches: list[Key[Array, " seeds"]], of_seeds: str
 ) -> dict[str, np.ndarray] | None:
     """The standard errors at a point, from scores with all batches of seeds.
 
-    `of_seeds` is the argument that says how many there are.
+    `problems` are of different series, whose scores are added up. `of_seeds` is the argument that
+    says how many seeds there are.
     """
+    problem = problems[0]
     point, unravel = ravel_pytree(reals)
     if point.size > _MOST_NUMBERS:
         raise ValueError(f"parameters: {point.size} numbers; differences do for {_MOST_NUMBERS}")
 
+    fold = jax.vmap(jax.random.fold_in, (0, None))
+    keys_of_problems = [
+        [fold(keys, number) if number else keys for keys in batches]
+        for number in range(len(problems))
+    ]
+
     def score(flat: np.ndarray) -> Float[np.ndarray, "seeds d"]:
         at = unravel(jnp.asarray(flat))
-        each = [np.asarray(score_of_each(keys, problem, at), float) for keys in batches]
-        return np.concatenate(each)
+        return sum(
+            np.concatenate([np.asarray(score_of_each(keys, part, at), float) for keys in keys_of])
+            for part, keys_of in zip(problems, keys_of_problems, strict=True)
+        )
 
     # By number, how far a step may go.
     longest = np.concatenate([

@@ -1,5 +1,6 @@
 """The log marginal likelihood of a filter as an objective of its parameters."""
 
+from itertools import chain
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -25,14 +26,33 @@ UnbiasedFilter = Annotated[
 
 
 class LogEvidence(eqx.Module):
-    """log Ẑ of a filter with one seed, summed over sequences of observations."""
+    """log Ẑ of a filter with one seed, for each sequence of observations."""
 
     groups: list[Series]  # sequences of one shape, stacked
+    # Of every sequence, as they stand in the groups, its place in the caller's list.
+    places: tuple[int, ...] = eqx.field(static=True, default=(0,))
 
-    def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, ""]:
-        """The sum over one run for each sequence."""
+    def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, " series"]:
+        """log Ẑ of one run for each sequence."""
         runs = self.runs(key, filter)
-        return jnp.asarray(sum(jnp.sum(run.log_marginal_likelihood) for run in runs))
+        return jnp.concatenate([run.log_marginal_likelihood for run in runs])
+
+    def parts(
+        self, size: int, rng: np.random.Generator | None = None
+    ) -> list[tuple[int, np.ndarray]]:
+        """All sequences in parts of one group and at most this size: the group, and which of it.
+
+        The parts, and the sequences in them, are in the order of `rng`, or as they stand.
+        """
+        parts = []
+        for g, group in enumerate(self.groups):
+            rows = np.arange(group.length) if rng is None else rng.permutation(group.length)
+            parts += [(g, part) for part in np.array_split(rows, -(-group.length // size))]
+        return parts if rng is None else [parts[k] for k in rng.permutation(len(parts))]
+
+    def part(self, group: int, rows: np.ndarray) -> "LogEvidence":
+        """That of some sequences of one group."""
+        return LogEvidence([jax.tree.map(lambda leaf: leaf[rows], self.groups[group])])
 
     def runs(self, key: Key[Array, ""], filter: Filter, whole: bool = False) -> list[FilterRun]:
         """The runs of each group, with all mixtures collected, or nothing."""
@@ -55,15 +75,19 @@ def pose_evidence(
     if not sequences:
         raise ValueError("observations: there are no sequences")
     groups: dict[str, list[Series]] = {}
-    for sequence in sequences:
+    places: dict[str, list[int]] = {}
+    for place, sequence in enumerate(sequences):
         series = as_series(sequence, filter.model)
-        groups.setdefault(kinds((series.observations, series.inputs)), []).append(series)
+        kind = kinds((series.observations, series.inputs))
+        groups.setdefault(kind, []).append(series)
+        places.setdefault(kind, []).append(place)
     stacked = []
     for group in groups.values():
         if any(series.present is not None for series in group):
             group = [with_present(series) for series in group]
         stacked.append(jax.tree.map(lambda *leaves: jnp.stack(leaves), *group))
-    return pose(filter, LogEvidence(stacked), parameters, transforms)
+    evidence = LogEvidence(stacked, tuple(chain.from_iterable(places.values())))
+    return pose(filter, evidence, parameters, transforms)
 
 
 def one_sequence(observations: PyTree, model: Any) -> Series:
@@ -73,19 +97,24 @@ def one_sequence(observations: PyTree, model: Any) -> Series:
     return as_series(observations, model)
 
 
-def warn_of_bias(caller: str, problem: Problem) -> None:
-    """Warn where the derivatives of a filter are not the score of what is tuned.
-
-    It does not warn for parameters of proposals, whose bound is maximised without the derivative of
-    the resampling, nor for filters that never resample.
-    """
+def names_but_proposals(problem: Problem) -> list[str]:
+    """The tuned parameters that are none of a proposal's."""
 
     def is_proposal(node: Any) -> bool:
         return isinstance(node, AbstractProposal)
 
     nodes = jax.tree.leaves(placed(problem.tree), is_leaf=is_proposal)
     places = jax.tree.leaves(list(filter(is_proposal, nodes)))
-    names = [name for name, index in problem.tuned if Place(index) not in places]
+    return [name for name, index in problem.tuned if Place(index) not in places]
+
+
+def warn_of_bias(caller: str, problem: Problem) -> None:
+    """Warn where the derivatives of a filter are not the score of what is tuned.
+
+    It does not warn for parameters of proposals, whose bound is maximised without the derivative of
+    the resampling, nor for filters that never resample.
+    """
+    names = names_but_proposals(problem)
     moves = [move for move in all_of(problem.tree.moves) if move.biases_score]
     if names and moves:
         said = f"{caller}: {type(moves[0]).__name__} has no gradient, so that the score of"

@@ -1,6 +1,6 @@
 """`fit` and `maximise`: gradient ascent on the log marginal likelihood, or another objective."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, CountOrZero, Rule, checked, shown, warn
 from mpfjax.filter import Filter
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.curvature import errors_at
-from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
+from mpfjax.tuning.evidence import names_but_proposals, pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import Objective, Parameters, Problem, Reals, Transforms, pose, scores
 
 Optimizer = Annotated[
@@ -24,6 +24,10 @@ Optimizer = Annotated[
         "an optimiser of optax, as optax.adam(0.05)",
     ),
 ]
+
+# Where fewer seeds than this count, the bias of log Ẑ is large and unknown.
+_FEWEST_SEEDS = 2.0
+_LAST_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -36,13 +40,15 @@ class TuningRun:
     parameters: dict[str, np.ndarray]
     """the same, by name, on their own scale."""
     value: float
-    """the objective with these parameters, of `fit` the log marginal likelihood summed over
-    sequences: the mean over seeds."""
+    """the objective with these parameters, of `fit` summed over sequences."""
     history: dict[str, np.ndarray]
-    """by step: `value`, the mean over seeds, and `deviation`, its standard deviation, with each
-    parameter, by name, as it was then."""
+    """by step: `value`, the objective, and `deviation`, the standard deviation over seeds, with
+    each parameter, by name, as it was then; of `fit` also `effective_seeds`, the mean over
+    sequences. Of a batch, the first two are scaled to all sequences."""
     stopped: str | None
     """why it ended before `num_steps`, or None."""
+    effective_seeds: Float[np.ndarray, " series"] | None = None
+    """of `fit`, for each sequence, (Σ Ẑ)² / Σ Ẑ² over seeds at the end: how many of them count."""
     standard_errors: dict[str, np.ndarray] | None = None
     """of every number in the parameters; None if not asked for, or if there is no maximum."""
 
@@ -58,17 +64,28 @@ def fit(
     parameters: Parameters = None,
     transforms: Transforms = None,
     num_seeds: Count = 8,
+    batch: Count | None = None,
+    pooled: bool | None = None,
     curvature_seeds: CountOrZero = 0,
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> TuningRun:
     """Maximise the log marginal likelihood over some of a filter's parameters.
 
-    Maximises the mean over seeds of log Ẑ(θ), summed over sequences, with the derivatives of the
-    filter's moves. Build the filter with `gradient="stop"`: its derivatives estimate the score.
-    With the default, "none", the optimisation ends somewhere else, however many particles there
-    are, and a warning says so. For the parameters of a proposal, such as a `NetworkProposal`,
-    "none" is right, and there is no warning.
+    Maximises, with the derivatives of the filter's moves, the sum over sequences s of
+
+        log (1 / K Σ_k Ẑ_s(θ; k)),
+
+    over K seeds k. Ẑ is unbiased, and the logarithm of its mean over seeds is biased far less than
+    log Ẑ of one seed, which lies below log Z by about half its variance. That variance depends on
+    θ, and over many sequences its effect does not average out. Build the filter with
+    `gradient="stop"`: its derivatives estimate the score. With the default, "none", the
+    optimisation ends somewhere else, however many particles there are, and a warning says so.
+
+    The parameters of a proposal, such as a `NetworkProposal`, do not change Z. For them alone the
+    mean over seeds of log Ẑ is maximised, a lower bound of log Z that a better proposal raises;
+    of a tighter bound the gradient would have more noise relative to its size (Rainforth et al.
+    2018). "none" is right for them, and there is no warning.
 
     - `observations`: arrays or a `Series`; a list is several sequences, each run on its own.
     - `optimizer`: an optimiser of optax. It steps in the unconstrained numbers of the transforms.
@@ -77,12 +94,19 @@ def fit(
       named Python float becomes an array.
     - `transforms`: by name, such as `Positive()` for a scale. A parameter without one has no
       constraint.
-    - `num_seeds`: the number of runs in each step, under one vmap.
+    - `num_seeds`: K, the number of runs of each sequence in a step, under one vmap.
+    - `batch`: the number of sequences in a step, in epochs of random order; None is all of them.
+      Sequences in a batch have one shape. A `batch` that divides their number compiles once.
+    - `pooled`: whether the mean over seeds is that of Ẑ, or of log Ẑ. None is as above: true unless
+      all parameters are of proposals.
     - `curvature_seeds`: the seeds for `standard_errors` at the end, in whole batches of
       `num_seeds`; 0 for none.
     - `checkpoint`: a `Checkpoint`, from whose file the same call goes on, also to a larger
       `num_steps`. All else must be the same: the filter and the observations to the bit, the
-      parameters, transforms, key and seeds, and the steps that the optimiser takes.
+      parameters, transforms, key, seeds and batches, and the steps that the optimiser takes.
+
+    A warning says so if fewer than two seeds count (`effective_seeds`), since log Ẑ varies much
+    from seed to seed: the bias is then about that of one seed.
 
     If the log marginal likelihood or the gradient is not finite, the optimisation ends with the
     last good parameters, a warning, and the step in `stopped`. Ctrl-C ends it with a warning as
@@ -93,16 +117,41 @@ def fit(
     """
     problem = pose_evidence(filter, observations, parameters, transforms)
     warn_of_bias("fit", problem)
-    ascent = _Ascent("fit", "log_marginal_likelihood", key, problem, optimizer, num_seeds)
+    if pooled is None:
+        pooled = bool(names_but_proposals(problem))
+    ascent = _Ascent(
+        "fit", "log_marginal_likelihood", key, problem, optimizer, num_seeds, batch, pooled
+    )
     data = {"observations": problem.objective}
-    reals, run = ascent.climb(num_steps, checkpoint, progress, data, {})
-    errors = None
+    reals, values, run = ascent.climb(num_steps, checkpoint, progress, data, {})
+    if pooled:
+        _warn_of_few_seeds(run[3]["effective_seeds"], values)
+    effective, errors = None, None
+    if values is not None:
+        effective = np.empty(values.shape[1])
+        effective[list(problem.objective.places)] = _effective_seeds(values)
     if curvature_seeds:
         key_curvature = jax.random.fold_in(key, num_steps + 1)
         shape = (-(-curvature_seeds // num_seeds), num_seeds)  # which is compiled already
         batches = list(jax.random.split(key_curvature, shape))
-        errors = errors_at(problem, reals, batches, "curvature_seeds")
-    return TuningRun(*run, standard_errors=errors)
+        errors = errors_at(ascent.parts(), reals, batches, "curvature_seeds")
+    return TuningRun(*run, effective_seeds=effective, standard_errors=errors)
+
+
+def _effective_seeds(values: Float[np.ndarray, "seeds series"]) -> Float[np.ndarray, " series"]:
+    """(Σ Ẑ)² / Σ Ẑ² of each series, from log Ẑ."""
+    weights = np.exp(values - values.max(axis=0))
+    return weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0)
+
+
+def _warn_of_few_seeds(history: np.ndarray, values: np.ndarray | None) -> None:
+    """Warn where about one seed decides the likelihood of each series, in the last steps."""
+    effective = history[-_LAST_STEPS:].mean()
+    if effective < _FEWEST_SEEDS and values is not None:
+        spread = values.std(axis=0, ddof=1).mean() if len(values) > 1 else np.nan
+        of = f", since log Ẑ has a standard deviation of {spread:.1f}" if len(values) > 1 else ""
+        said = f"only {effective:.1f} of {len(values)} seeds count for a series{of}, and the"
+        warn(f"fit: {said} parameters are biased; raise num_particles or num_seeds", UserWarning)
 
 
 @checked
@@ -136,12 +185,13 @@ def maximise(
     """
     problem = pose(model, objective, parameters, transforms)
     ascent = _Ascent("maximise", "value", key, problem, optimizer, num_seeds)
-    found = eqx.filter_eval_shape(problem.value, key, problem.start())
+    found = eqx.filter_eval_shape(objective, key, problem.at(problem.start()))
     if getattr(found, "shape", None) != () or not jnp.issubdtype(found.dtype, jnp.floating):
         raise ValueError(f"objective: it returns {shown(found)}, no floating point scalar")
     functions = {"objective": (problem.value, key, problem.start())}
     data = {"objective": objective}
-    _, run = ascent.climb(num_steps, checkpoint, progress, data, functions)
+    _, _, run = ascent.climb(num_steps, checkpoint, progress, data, functions)
+    del run[3]["effective_seeds"]  # of values that are no logarithms of likelihoods
     return TuningRun(*run)
 
 
@@ -155,6 +205,8 @@ class _Ascent:
     problem: Problem
     optimizer: optax.GradientTransformation
     num_seeds: int
+    batch: int | None = None  # of the series in a step, where the objective is a `LogEvidence`
+    pooled: bool = False
 
     def climb(
         self,
@@ -163,14 +215,14 @@ class _Ascent:
         progress: bool,
         data: dict[str, Any],
         functions: dict[str, Any],
-    ) -> tuple[Reals, tuple]:
-        """The parameters at the end, and the first fields of a `TuningRun`."""
+    ) -> tuple[Reals, Float[np.ndarray, "seeds series"] | None, tuple]:
+        """The parameters at the end, the objective there, and the first fields of a `TuningRun`."""
         reals = self.problem.start()
         optimizer = self.optimizer.init(reals)
         no_path = jax.tree.map(lambda u: np.empty((0, *u.shape), u.dtype), reals)
-        start = State(0, (reals, optimizer), (np.empty(0), np.empty(0), no_path))
+        start = State(0, (reals, optimizer), (np.empty(0), np.empty(0), np.empty(0), no_path))
         settings = {"key": self.key, "num_seeds": int(self.num_seeds)}
-        settings |= self.problem.settings | data
+        settings |= {"batch": self.batch, "pooled": self.pooled} | self.problem.settings | data
 
         def first(reals: Reals) -> Any:
             return self._updated(reals, self.optimizer.init(reals), reals)
@@ -179,25 +231,60 @@ class _Ascent:
         identity = identity_of(self.caller, checkpoint, settings, functions)
         run = LongRun(self.caller, num_steps, checkpoint, progress, lambda step: identity)
         state, stopped = run.go(start, lambda: start, self._advance)
-        (reals, _), (values, deviations, path) = state.carry, state.rows
+        (reals, _), (averages, deviations, effective, path) = state.carry, state.rows
+        key = jax.random.fold_in(self.key, state.step)
         try:
-            value = float(self._evaluated(state.step, reals)[0].mean())
+            values = np.concatenate([
+                self._evaluated(jax.random.fold_in(key, number) if number else key, part, reals)[0]
+                for number, part in enumerate(self.parts())
+            ], axis=1)  # fmt: skip
+            value = self._average(values)
         except Broken as fault:
             # The parameters are those of the step before, and so is their value.
             if stopped is None:
                 stopped = f"{fault} at step {state.step}"
                 warn(f"{self.caller}: {stopped}; its result is of the step before", UserWarning)
-            reals, value = jax.tree.map(lambda rows: jnp.asarray(rows[-1]), path), float(values[-1])
-        history = {"value": values, "deviation": deviations}
+            reals = jax.tree.map(lambda rows: jnp.asarray(rows[-1]), path)
+            values, value = None, float(averages[-1])
+        history = {"value": averages, "deviation": deviations, "effective_seeds": effective}
         history |= self.problem.constrained_rows(path)
         parameters = jax.tree.map(np.asarray, self.problem.constrain(reals))
-        return reals, (self.problem.at(reals), parameters, value, history, stopped)
+        return reals, values, (self.problem.at(reals), parameters, value, history, stopped)
 
-    def _evaluated(self, step: int, reals: Reals) -> tuple[np.ndarray, Reals]:
-        """The objective of each seed, and the gradient of their mean; `Broken` if not finite."""
-        keys = jax.random.split(jax.random.fold_in(self.key, step), self.num_seeds)
-        values, gradient = scores(keys, self.problem, reals)
-        values, named = np.asarray(values), self.objective.replace("_", " ")
+    def parts(self) -> list[Problem]:
+        """The problem, or one for each batch of series, in the order in which they stand."""
+        if self.batch is None:
+            return [self.problem]
+        evidence = self.problem.objective
+        return [self._of(evidence.part(*part)) for part in evidence.parts(self.batch)]
+
+    def _of(self, objective: Any) -> Problem:
+        return replace(self.problem, objective=objective)
+
+    def _at_step(self, step: int) -> tuple[Problem, int]:
+        """The problem of a step's batch, and how many batches there are in its epoch."""
+        if self.batch is None:
+            return self.problem, 1
+        evidence = self.problem.objective
+        num_parts = len(evidence.parts(self.batch))
+        epoch, place = divmod(step, num_parts)
+        seed = np.asarray(jax.random.key_data(self.key)).ravel()
+        parts = evidence.parts(self.batch, np.random.default_rng([*seed, epoch]))
+        return self._of(evidence.part(*parts[place])), num_parts
+
+    def _average(self, values: Float[np.ndarray, "seeds series"]) -> float:
+        """The average over seeds, summed over series."""
+        if not self.pooled:
+            return float(values.mean(axis=0).sum())
+        return float((np.logaddexp.reduce(values, axis=0) - np.log(len(values))).sum())
+
+    def _evaluated(
+        self, key: Key[Array, ""], problem: Problem, reals: Reals
+    ) -> tuple[Float[np.ndarray, "seeds series"], Reals]:
+        """The objective of each seed, and the gradient of their average; `Broken` if not finite."""
+        keys = jax.random.split(key, self.num_seeds)
+        values, gradient = scores(keys, problem, reals, self.pooled)
+        values, named = np.asarray(values, float), self.objective.replace("_", " ")
         broken = [name for name, leaf in gradient.items() if not np.isfinite(leaf).all()]
         if not np.isfinite(values).all():
             raise Broken(f"the {named} was {values.mean()}")
@@ -208,13 +295,17 @@ class _Ascent:
     def _advance(self, step: int, last: int, carry: PyTree) -> tuple[int, PyTree, PyTree]:
         """One step up."""
         reals, optimizer = carry
-        values, gradient = self._evaluated(step, reals)
+        problem, factor = self._at_step(step)
+        values, gradient = self._evaluated(jax.random.fold_in(self.key, step), problem, reals)
         idle = [name for name, leaf in gradient.items() if not np.asarray(leaf).any()]
         if step == 0 and idle:
             named = self.objective.replace("_", " ")
             raise ValueError(f"parameters: the {named} does not depend on {', '.join(idle)}")
+        gradient = jax.tree.map(lambda leaf: factor * leaf, gradient)
         updated, optimizer = self._updated(gradient, optimizer, reals)
-        row = values.mean(), values.std(), jax.tree.map(np.asarray, reals)
+        deviation = np.sqrt(factor) * values.sum(axis=1).std()
+        effective = _effective_seeds(values).mean()
+        row = factor * self._average(values), deviation, effective, reals
         row = jax.tree.map(lambda leaf: np.asarray(leaf)[None], row)
         return step + 1, (updated, optimizer), row
 

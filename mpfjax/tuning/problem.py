@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
+from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import by_name, shown
@@ -34,7 +35,8 @@ class Problem(eqx.Module):
 
     leaves: list[Any]
     transforms: dict[str, AbstractTransform]
-    # Of a seed and the tree that the leaves are of, a scalar; its arrays are the data.
+    # Of a seed and the tree that the leaves are of, a scalar, or one for each of several series that
+    # are added up; its arrays are the data.
     objective: Objective
     # The parameters' names, and where they are among the leaves.
     tuned: tuple[tuple[str, int], ...] = eqx.field(static=True)
@@ -106,20 +108,27 @@ class Problem(eqx.Module):
 
     def value(self, key: Key[Array, ""], reals: Reals) -> Float[Array, ""]:
         """The objective of one seed."""
-        return self.objective(key, self.at(reals))
+        return jnp.sum(self.objective(key, self.at(reals)))
 
 
 @eqx.filter_jit
 def scores(
-    keys: Key[Array, " seeds"], problem: Problem, reals: Reals
-) -> tuple[Float[Array, " seeds"], Reals]:
-    """The objective of each seed, and the gradient of their mean."""
+    keys: Key[Array, " seeds"], problem: Problem, reals: Reals, pooled: bool = False
+) -> tuple[Float[Array, "seeds series"], Reals]:
+    """The objective of each seed and series, and the gradient of their average over seeds.
 
-    def mean(reals: Reals) -> tuple[Float[Array, ""], Float[Array, " seeds"]]:
-        values = jax.vmap(lambda key: problem.value(key, reals))(keys)
-        return jnp.mean(values), values
+    The average is the mean, or if `pooled` the logarithm of the mean of the exponentials, summed
+    over series.
+    """
 
-    gradient, values = jax.grad(mean, has_aux=True)(reals)
+    def average(reals: Reals) -> tuple[Float[Array, ""], Float[Array, "seeds series"]]:
+        values = jax.vmap(lambda key: problem.objective(key, problem.at(reals)))(keys)
+        values = values.reshape(len(keys), -1)
+        # The constant of the second does not change the gradient.
+        averages = logsumexp(values, axis=0) if pooled else jnp.mean(values, axis=0)
+        return jnp.sum(averages), values
+
+    gradient, values = jax.grad(average, has_aux=True)(reals)
     return values, gradient
 
 

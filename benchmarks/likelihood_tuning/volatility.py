@@ -1,0 +1,225 @@
+"""A published task: the parameters of stochastic volatility, learned from many series.
+
+Brady, Cox, Elvira and Li (2025), PyDPF, whose examples publish the spread of gradients and the
+errors of learned parameters, with N = 100. The grid filter has the exact scores and maxima.
+"""
+
+import warnings
+from functools import partial
+from time import process_time
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.scipy.special import logsumexp
+from jax.scipy.stats import norm
+from jaxtyping import Array, Float
+
+import mpfjax
+from benchmarks import harness
+from mpfjax.exact import grid_filter
+from mpfjax.tuning import Interval, Positive, fit
+from mpfjax.tuning.problem import Reals
+
+LENGTH = 101
+TRUTH = {"alpha": 0.91, "beta": 0.5, "sigma": 1.0}
+PARAMETERS = {name: lambda filter, name=name: getattr(filter.model, name) for name in TRUTH}
+TRANSFORMS = {"alpha": Interval(0.0, 1.0), "beta": Positive(), "sigma": Positive()}
+# Of the published tables: the spread of the score in α per observation, and mean errors.
+PUBLISHED_SPREADS = {"none": 0.035, "stop": 1.165, "marginal stop-gradient": 0.476}
+PUBLISHED = [
+    {"method": "pydpf, detached", "alpha": 0.0044, "beta": 0.040, "sigma": 0.027},
+    {"method": "pydpf, stop-gradient", "alpha": 0.0126, "beta": 0.113, "sigma": 0.049},
+    {"method": "pydpf, marginal stop-gradient", "alpha": 0.0044, "beta": 0.115, "sigma": 0.049},
+]  # fmt: skip
+# Of fit: the estimator of the filter, whether seeds are pooled, their number.
+METHODS = {
+    "no gradient of resampling, K = 1": ("none", False, 1),
+    "mean of log Ẑ, K = 1": ("stop", False, 1),
+    "mean of log Ẑ, K = 8": ("stop", False, 8),
+    "log of mean Ẑ, K = 8": ("stop", True, 8),
+}
+NUM_PARTICLES, BATCH, NUM_STEPS = 100, 32, 160
+
+
+class StochasticVolatility(mpfjax.AbstractStateSpaceModel):
+    """x_t = α x_{t-1} + σ N(0, 1), x_0 stationary; y_t ~ N(0, β² exp x_t)."""
+
+    alpha: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    beta: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    sigma: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+
+    @property
+    def deviation(self) -> Float[Array, ""]:
+        """That of x_0."""
+        return self.sigma / jnp.sqrt(1 - self.alpha**2)
+
+    def sample_initial(self, key: Array, num_particles: int) -> Float[Array, " n"]:
+        """From the stationary distribution."""
+        return self.deviation * jax.random.normal(key, (num_particles,))
+
+    def sample_transition(self, key: Array, states: Float[Array, " n"]) -> Float[Array, " n"]:
+        """One step of the autoregression."""
+        return self.alpha * states + self.sigma * jax.random.normal(key, states.shape)
+
+    def log_initial(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The density of the stationary distribution."""
+        return norm.logpdf(states, 0.0, self.deviation)
+
+    def log_transition(
+        self, states: Float[Array, " n"], previous_states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """The density of a step."""
+        return norm.logpdf(states, self.alpha * previous_states, self.sigma)
+
+    def log_likelihood(
+        self, observation: Float[Array, ""], states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """y_t ~ N(0, β² exp x_t)."""
+        return norm.logpdf(observation, 0.0, self.beta * jnp.exp(states / 2))
+
+
+def simulate(num_series: int, seed: int) -> Float[np.ndarray, "series t"]:
+    """Series with the true parameters."""
+    rng = np.random.default_rng(seed)
+    alpha, beta, sigma = TRUTH.values()
+    states = rng.normal(size=num_series) * sigma / np.sqrt(1 - alpha**2)
+    rows = []
+    for _ in range(LENGTH):
+        states = alpha * states + sigma * rng.normal(size=num_series)
+        rows.append(beta * np.exp(states / 2) * rng.normal(size=num_series))
+    return np.array(rows, np.float32).T
+
+
+def volatility_filter(estimator: Any, start: dict[str, Any]) -> mpfjax.Filter:
+    """The bootstrap filter; "pathwise" differentiates the draws."""
+    model = StochasticVolatility(**start)
+    if estimator == "pathwise":
+        moves = [mpfjax.Resample(gradient="stop"), mpfjax.Propagate()]
+        return mpfjax.Filter(model, moves, NUM_PARTICLES)
+    return mpfjax.particle_filter(model, NUM_PARTICLES, gradient=estimator)
+
+
+def constrained(reals: Reals) -> dict[str, Array]:
+    """The parameters on their own scale."""
+    return {name: TRANSFORMS[name].constrain(u) for name, u in reals.items()}
+
+
+def unconstrained(values: dict[str, float]) -> Reals:
+    """Logit and logarithms."""
+    return {name: TRANSFORMS[name].unconstrain(jnp.float32(v)) for name, v in values.items()}
+
+
+@jax.jit
+def exact_scores(reals: Reals, observations: Float[Array, "s t"]) -> Float[Array, "s 3"]:
+    """The score of each series by the grid filter, α, β and σ."""
+    grid = jnp.linspace(-16.0, 16.0, 161)
+
+    @jax.grad
+    def score(reals: Reals, y: Array) -> Array:
+        model = StochasticVolatility(**constrained(reals))
+        return grid_filter(model, y, grid).log_marginal_likelihood
+
+    return jax.lax.map(lambda y: jnp.stack([*score(reals, y).values()]), observations, batch_size=8)
+
+
+@partial(jax.jit, static_argnames=("estimator", "num_seeds", "pooled"))
+def estimated_scores(
+    reals: Reals, observations: Array, keys: Array, estimator: str, num_seeds: int, pooled: bool
+) -> Float[Array, "s 3"]:
+    """The same by the filter, with one key for each series."""
+
+    @jax.grad
+    def score(reals: Reals, y: Array, key: Array) -> Array:
+        filter = volatility_filter(estimator, constrained(reals))
+
+        def log_evidence(key: Array) -> Array:
+            return mpfjax.run_filter(key, filter, y, harness.nothing).log_marginal_likelihood
+
+        values = jax.vmap(log_evidence)(jax.random.split(key, num_seeds))
+        return logsumexp(values) if pooled else jnp.mean(values)
+
+    def of_series(one: tuple[Array, Array]) -> Array:
+        return jnp.stack([*score(reals, *one).values()])
+
+    return jax.lax.map(of_series, (observations, keys), batch_size=64 // num_seeds)
+
+
+def gradients(runs: int, seed: int) -> list[dict[str, Any]]:
+    """The score in α per observation, of one series at α = .93, by each method of `fit`."""
+    y = jnp.asarray(simulate(1, seed))
+    at = unconstrained(TRUTH | {"alpha": 0.93})
+    slope = LENGTH * 0.93 * 0.07  # of the logit, for scores in α itself, per observation
+    exact = float(exact_scores(at, y)[0, 0]) / slope
+    keys, entries = jax.random.split(jax.random.key(seed), runs), []
+    copies = jnp.broadcast_to(y, (runs, LENGTH))
+    for method, (estimator, pooled, num_seeds) in METHODS.items():
+        start = process_time()
+        rows = np.asarray(estimated_scores(at, copies, keys, estimator, num_seeds, pooled))
+        values = rows[:, 0] / slope
+        entries.append({
+            "method": method, "exact": exact, "bias": float(values.mean() - exact),
+            "standard_error": float(values.std(ddof=1) / np.sqrt(runs)),
+            "deviation": float(values.std(ddof=1)), "seconds": process_time() - start,
+        })  # fmt: skip
+    return entries
+
+
+def maximum(observations: Array) -> tuple[Reals, Float[np.ndarray, "3 3"]]:
+    """The exact maximum, and the second derivatives there, by Newton's method from the truth."""
+    point, hessian = unconstrained(TRUTH), np.eye(3)
+
+    def score(point: Reals) -> np.ndarray:
+        return np.asarray(exact_scores(point, observations), float).sum(axis=0)
+
+    for _ in range(3):
+        centre = score(point)
+        moved = [score(point | {name: point[name] + 0.02}) for name in TRUTH]
+        hessian = (np.array(moved) - centre) / 0.02
+        hessian = (hessian + hessian.T) / 2
+        step = np.linalg.solve(hessian, centre)
+        point = {name: point[name] - jnp.float32(d) for name, d in zip(TRUTH, step, strict=True)}
+    return point, hessian
+
+
+def shifts(num_series: int, repeats: int, seed: int) -> list[dict[str, Any]]:
+    """How far each method moves the exact maximum: the bias of its score there, by Newton's step.
+
+    In logit α, log β and log σ, with standard errors over series and repeats.
+    """
+    observations = jnp.asarray(simulate(num_series, seed))
+    point, hessian = maximum(observations)
+    repeated = jnp.tile(observations, (repeats, 1))
+    exact = np.tile(np.asarray(exact_scores(point, observations), float), (repeats, 1))
+    keys, entries = jax.random.split(jax.random.key(seed), len(repeated)), []
+    for method, (estimator, pooled, num_seeds) in METHODS.items():
+        rows = estimated_scores(point, repeated, keys, estimator, num_seeds, pooled)
+        moves = -num_series * np.linalg.solve(hessian, (np.asarray(rows, float) - exact).T).T
+        error = moves.std(axis=0, ddof=1) / np.sqrt(len(moves))
+        entry = {"method": method, "maximum": jax.tree.map(float, constrained(point))}
+        entry["shift"] = dict(zip(TRUTH, moves.mean(axis=0).tolist(), strict=True))
+        entries.append(entry | {"error": dict(zip(TRUTH, error.tolist(), strict=True))})
+    return entries
+
+
+def learned(num_series: int, method: str, steps: int, seed: int) -> dict[str, Any]:
+    """The parameters that `fit` finds on one data set, from a random start of the published task."""
+    rng = np.random.default_rng([seed, 1])
+    start = {"alpha": rng.uniform(), "beta": rng.uniform(0.0, 2.0), "sigma": rng.uniform(0.0, 5.0)}
+    estimator, pooled, num_seeds = METHODS[method]
+    began = process_time()
+    with warnings.catch_warnings(action="ignore"):  # of the biases that are measured here
+        run = fit(
+            jax.random.key(seed), volatility_filter(estimator, start),
+            list(simulate(num_series, seed)), optax.adam(optax.cosine_decay_schedule(0.15, steps)),
+            steps, parameters=PARAMETERS, transforms=TRANSFORMS, num_seeds=num_seeds,
+            batch=min(BATCH, num_series), pooled=pooled, progress=False,
+        )  # fmt: skip
+    errors = {name: abs(float(run.parameters[name]) - true) for name, true in TRUTH.items()}
+    effective = float(np.mean(run.effective_seeds))
+    return {"method": method, "seed": seed, "seconds": process_time() - began} | errors | {
+        "effective_seeds": effective, "start": start,
+    }  # fmt: skip
