@@ -35,7 +35,7 @@ from tqdm import tqdm
 
 import mpfjax
 from mpfjax import console
-from mpfjax.console import exit_status, write_json
+from mpfjax.console import exit_status, format_table, write_json
 from mpfjax.running.storage import write_whole
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -284,18 +284,6 @@ def pivot(
     names = dict.fromkeys(_cell(column, entry) for entry in entries)
     rows = [[name, *(cells.get(each, "-") for each in names)] for name, cells in found.items()]
     return format_table([title, *names], rows)
-
-
-def format_table(header: list[str], rows: list[list[str]]) -> str:
-    """A table in plain text, columns aligned to the right but for the first."""
-    widths = [max(len(line[i]) for line in [header, *rows]) for i in range(len(header))]
-
-    def format_line(cells: list[str]) -> str:
-        first, *rest = zip(cells, widths, strict=True)
-        return "  ".join([first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in rest)])
-
-    rule = "  ".join("-" * width for width in widths)
-    return "\n".join([format_line(header), rule, *map(format_line, rows)])
 
 
 def _shown(name: str, entry: Mapping[str, Any]) -> str:

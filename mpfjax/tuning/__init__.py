@@ -3,6 +3,7 @@
 from mpfjax.tuning.bijections import Interval as Interval
 from mpfjax.tuning.bijections import Positive as Positive
 from mpfjax.tuning.bijections import Simplex as Simplex
+from mpfjax.tuning.comparison import compare_evidence as compare_evidence
 from mpfjax.tuning.curvature import standard_errors as standard_errors
 from mpfjax.tuning.densities import log_density as log_density
 from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
@@ -12,5 +13,4 @@ from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
 from mpfjax.tuning.optimisation import fit as fit
 from mpfjax.tuning.optimisation import maximise as maximise
 from mpfjax.tuning.predictive import posterior_predictive as posterior_predictive
-from mpfjax.tuning.predictive import to_inference_data as to_inference_data
 from mpfjax.tuning.sequential import smc2 as smc2

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,6 +19,13 @@ from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.running.long_runs import Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.densities import SamplePrior, chosen, drawn
 from mpfjax.tuning.problem import Problem, Reals
+from mpfjax.tuning.summaries import (
+    effective_sample_size,
+    numbers_of,
+    row_of,
+    split_r_hat,
+    table,
+)
 from mpfjax.tuning.walks import RandomWalk, random_walk
 
 _MOST_DRAWS_OF_A_START = 100
@@ -29,7 +36,7 @@ _MOST_BYTES_AT_ONCE = 2**24
 _SECONDS_BETWEEN = 0.5
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class PosteriorOfChains:
     """What the chains of every sampler leave, after their burn-in."""
 
@@ -45,11 +52,34 @@ class PosteriorOfChains:
     """of the random walk after burn-in, in unconstrained numbers, in the order of their names."""
     problem: Problem | None = field(default=None, repr=False, compare=False)
     """what was sampled: the filter, its parameters and the observations."""
+    one_start: bool = False
+    """whether several chains started at the same parameters, so that R-hat means nothing."""
 
     @property
     def acceptance_rate(self) -> float:
         """The share of steps, or of Metropolis steps, that moved."""
         return float(self.accepted.mean())
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """By parameter, or number of one: mean, deviation, quantiles, effective size and R-hat.
+
+        Of split chains, as Vehtari et al. (2021) have them, without ranks. R-hat is NaN if all
+        chains started at one point. It prints as a table.
+        """
+        rows = {}
+        for name, draws in numbers_of(self.parameters, 2).items():
+            rows[name] = row_of(draws.ravel())
+            rows[name]["effective size"] = effective_sample_size(draws)
+            rows[name]["R-hat"] = np.nan if self.one_start else split_r_hat(draws)
+        return rows
+
+    def __repr__(self) -> str:
+        num_chains, num_draws = self.accepted.shape
+        chains = f"{num_chains} chains" if num_chains > 1 else "1 chain"
+        heading = f"{chains} of {num_draws} draws, {self.acceptance_rate:.0%} accepted"
+        if self.one_start:
+            heading += "; all start at one point: no R-hat without sample_prior"
+        return table(heading + (f"; {self.stopped}" if self.stopped else ""), self.summary())
 
 
 class Step(NamedTuple):
@@ -76,17 +106,6 @@ class AbstractKernel(eqx.Module):
         """One step of one chain."""
 
 
-class ChainOptions(TypedDict, total=False):
-    """What `metropolis_hastings` and `particle_gibbs` both take, beside their own arguments."""
-
-    num_chains: int
-    sample_prior: SamplePrior | None
-    burn_in: int
-    thinning: int
-    checkpoint: Checkpoint | None
-    progress: bool
-
-
 class Chains(eqx.Module):
     """The present state of all chains."""
 
@@ -103,12 +122,12 @@ class Sampling(Checked):
     problem: Problem
     deviations: Reals  # of the random walk at first
     num_steps: Count
-    num_chains: Count = 1
-    sample_prior: SamplePrior | None = None
-    burn_in: CountOrZero = 0
-    thinning: Count = 1
-    checkpoint: Checkpoint | None = None
-    progress: bool = True
+    num_chains: Count
+    sample_prior: SamplePrior | None
+    burn_in: CountOrZero
+    thinning: Count
+    checkpoint: Checkpoint | None
+    progress: bool
 
     def __check_init__(self) -> None:
         super().__check_init__()
@@ -146,7 +165,7 @@ class Sampling(Checked):
         return rest, {
             "parameters": self.problem.constrained_rows(reals), "problem": self.problem,
             "proposal_covariance": factor @ factor.T, "num_invalid": num_invalid,
-            "stopped": stopped,
+            "stopped": stopped, "one_start": self.num_chains > 1 and self.sample_prior is None,
         }  # fmt: skip
 
     def _starts(

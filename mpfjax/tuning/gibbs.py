@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Unpack, cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import Count, checked, saying
+from mpfjax.checks import Count, CountOrZero, checked, saying
 from mpfjax.filter import Filter
 from mpfjax.models.base import require, with_inputs
 from mpfjax.models.law import law_of
 from mpfjax.models.observations import Series, with_gaps
+from mpfjax.running.long_runs import Checkpoint
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.conditional import (
@@ -24,11 +25,12 @@ from mpfjax.smoothing.conditional import (
     renew,
     shape_of_trajectory,
 )
-from mpfjax.tuning.chains import AbstractKernel, ChainOptions, PosteriorOfChains, Sampling, Step
+from mpfjax.tuning.chains import AbstractKernel, PosteriorOfChains, Sampling, Step
 from mpfjax.tuning.densities import (
     LogPrior,
     Point,
     Prior,
+    SamplePrior,
     checked_prior,
     chosen,
     evaluated,
@@ -43,7 +45,7 @@ _NUM_METROPOLIS_STEPS = 5  # for one new trajectory; they cost little
 Draw = Callable[[Key[Array, ""], PyTree, PyTree, Any], Mapping[str, Any]]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class GibbsPosterior(PosteriorOfChains):
     """The chains of `particle_gibbs`, after their burn-in.
 
@@ -76,7 +78,12 @@ def particle_gibbs(
     parameters: Parameters = None,
     transforms: Transforms = None,
     collect: Callable[[PyTree], PyTree] | None = None,
-    **options: Unpack[ChainOptions],
+    num_chains: Count = 1,
+    sample_prior: SamplePrior | None = None,
+    burn_in: CountOrZero = 0,
+    thinning: Count = 1,
+    checkpoint: Checkpoint | None = None,
+    progress: bool = True,
 ) -> GibbsPosterior:
     """Sample p(θ, x_0, ..., x_t | y_1..y_t), parameters and trajectory in turn.
 
@@ -99,8 +106,8 @@ def particle_gibbs(
       `lambda trajectory: trajectory[-1]`, or `lambda trajectory: None`. None keeps all.
     - `observations`: one sequence, arrays or a `Series`. `parameters`, `transforms`: as for `fit`.
       Parameters are usually the model's; those of a proposal have no posterior.
-    - `num_chains`, `sample_prior`, `burn_in`, `thinning`, `checkpoint`, `progress`: the further
-      options of `metropolis_hastings`. Each chain starts at a trajectory of its own. In the burn-in
+    - `num_chains`, `sample_prior`, `burn_in`, `thinning`, `checkpoint`: as for
+      `metropolis_hastings`. Each chain starts at a trajectory of its own. In the burn-in
       the random walk learns its scale too, since the density given a trajectory has no noise: it
       aims at accepting 44% of the Metropolis steps for one number, 23% for several. With `draw`
       nothing is learned.
@@ -126,12 +133,15 @@ def particle_gibbs(
     series = one_sequence(observations, filter.model)
     problem = pose(filter, LogJoint(series), parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())
-    sampling = Sampling("particle_gibbs", key, problem, deviations, num_steps, **options)
+    sampling = Sampling(
+        "particle_gibbs", key, problem, deviations, num_steps, num_chains, sample_prior,
+        burn_in, thinning, checkpoint, progress,
+    )  # fmt: skip
     prior = None
     if log_prior is not None:
         for density in ("log_transition", "log_initial"):
             require(filter.model, density, "particle_gibbs with log_prior")
-        prior = checked_prior(log_prior, problem, key, sampling.sample_prior)
+        prior = checked_prior(log_prior, problem, key, sample_prior)
     kernel = _Kernel(problem, prior, draw, collect, backward)
     start, trajectory = problem.start(), shape_of_trajectory(filter.model, series.length + 1)
     functions = {"log_prior": (prior, start), "collect": (collect, trajectory)}

@@ -2,21 +2,22 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Unpack
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import Count, checked
-from mpfjax.tuning.chains import AbstractKernel, ChainOptions, PosteriorOfChains, Sampling, Step
-from mpfjax.tuning.densities import LogDensity, LogPrior, Point, checked_prior
+from mpfjax.checks import Count, CountOrZero, checked
+from mpfjax.running.long_runs import Checkpoint
+from mpfjax.tuning.chains import AbstractKernel, PosteriorOfChains, Sampling, Step
+from mpfjax.tuning.densities import LogDensity, LogPrior, Point, SamplePrior, checked_prior
 from mpfjax.tuning.evidence import UnbiasedFilter, pose_evidence
 from mpfjax.tuning.problem import Parameters, Reals, Transforms
 from mpfjax.tuning.walks import RandomWalk, checked_deviations, metropolis_step
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Posterior(PosteriorOfChains):
     """The chains of `metropolis_hastings`, after their burn-in.
 
@@ -41,7 +42,12 @@ def metropolis_hastings(
     proposal_deviations: float | Mapping[str, Any] = 0.1,
     parameters: Parameters = None,
     transforms: Transforms = None,
-    **options: Unpack[ChainOptions],
+    num_chains: Count = 1,
+    sample_prior: SamplePrior | None = None,
+    burn_in: CountOrZero = 0,
+    thinning: Count = 1,
+    checkpoint: Checkpoint | None = None,
+    progress: bool = True,
 ) -> Posterior:
     """Sample p(θ | y_1..y_t) with the filter's estimate Ẑ(θ) in place of the likelihood.
 
@@ -66,8 +72,6 @@ def metropolis_hastings(
       by name, each a number or of the parameter's unconstrained shape. 2.4 / sqrt(d) standard
       errors is a good start.
 
-    Further options, as of `particle_gibbs`:
-
     - `num_chains`: 1 by default; they run under one vmap.
     - `sample_prior`: where the chains start: a function of a key that draws one θ, the parameters
       by name on their own scale. R-hat means something only for chains that start further apart
@@ -79,7 +83,6 @@ def metropolis_hastings(
     - `thinning`: k keeps every k-th step, for chains that are too long for memory.
     - `checkpoint`: a `Checkpoint`, from whose file the same call goes on, also to a larger
       `num_steps`. All else must be the same.
-    - `progress`: show a bar of the steps, as by default.
 
     A proposal with a prior or likelihood that is NaN or +inf is rejected, and counted in
     `num_invalid`, with a warning. Ctrl-C returns the draws so far with a warning, if there are any.
@@ -93,8 +96,11 @@ def metropolis_hastings(
     """
     problem = pose_evidence(filter, observations, parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())
-    sampling = Sampling("metropolis_hastings", key, problem, deviations, num_steps, **options)
-    prior = checked_prior(log_prior, problem, key, sampling.sample_prior)
+    sampling = Sampling(
+        "metropolis_hastings", key, problem, deviations, num_steps, num_chains, sample_prior,
+        burn_in, thinning, checkpoint, progress,
+    )  # fmt: skip
+    prior = checked_prior(log_prior, problem, key, sample_prior)
     density = LogDensity(problem, prior)
     data = {"observations": problem.objective}
     functions = {"log_prior": (prior, problem.start())}

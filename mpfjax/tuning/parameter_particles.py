@@ -125,7 +125,8 @@ def extended(key, sampler, samples, t):
 def rejuvenated(key, sampler, samples, num_steps):
     """Samples of equal weight, from chains that start at resampled ones.
 
-    Also the share of accepted steps, and how often a density was no number, by name.
+    Also from which sample each comes, the share of accepted steps, and how often a density was no
+    number, by name.
     """
     key_resample, key_moves = jax.random.split(key)
     points = jax.vmap(lambda reals: ravel_pytree(reals)[0])(samples.particles.reals)
@@ -133,7 +134,9 @@ def rejuvenated(key, sampler, samples, num_steps):
     factor = factor_of(samples.average(centred[:, :, None] * centred[:, None, :]))
     num_moves = sampler.num_moves
     num_chains = samples.num_particles // (num_moves + 1)
-    resampled = Resample(particles_per_component=num_chains)(key_resample, samples)
+    # Multinomial, whose families say how large the error of the evidence is.
+    resample = Resample(scheme="multinomial", particles_per_component=num_chains)
+    resampled = resample(key_resample, samples)
     starts = jax.tree.map(lambda leaf: leaf[:num_chains], resampled.particles)
 
     evaluate = partial(sampler.run_again, num_steps=num_steps)
@@ -153,7 +156,9 @@ def rejuvenated(key, sampler, samples, num_steps):
     everywhere = jax.tree.map(end_to_end, starts, paths)
     rate = jnp.mean(accepted.astype(samples.log_weights.dtype))
     counts = jax.tree.map(lambda some: jnp.sum(some, dtype=jnp.int32), invalid)
-    return single_component(everywhere), rate, counts
+    ancestors = resampled.ancestor_indices[:num_chains]
+    ancestors = jnp.concatenate([ancestors, jnp.repeat(ancestors, num_moves)])
+    return single_component(everywhere), ancestors, rate, counts
 
 
 @jit_on_wide_vectors

@@ -17,14 +17,16 @@ from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn
 from mpfjax.tuning.evidence import UnbiasedFilter, one_sequence, pose_evidence, with_present
 from mpfjax.tuning.parameter_particles import Sampler, exchanged, extended, rejuvenated, started
 from mpfjax.tuning.problem import Parameters, Problem, Transforms
+from mpfjax.tuning.summaries import numbers_of, row_of, table
 
 # The share of their number below which the effective sample size of the θs leads to moves.
 _ESS_THRESHOLD = 0.5
+_FEWEST_FAMILIES = 10
 # N is doubled after moves that accept less.
 _ACCEPTANCE_THRESHOLD = 0.2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SequentialPosterior:
     """The weighted samples of `smc2` after the last observation, and their history."""
 
@@ -47,6 +49,8 @@ class SequentialPosterior:
     """why it ended before the last observation, or None."""
     problem: Problem | None = field(default=None, repr=False, compare=False)
     """what was sampled: the filter, its parameters and the observations."""
+    families: Int[np.ndarray, " samples"] = field(default_factory=lambda: np.zeros(0, int))
+    """from which draw of the prior each sample descends."""
     mixtures: Any = field(default=None, repr=False, compare=False)
     """of each sample's own filter, after the last observation."""
     _goes_on: "tuple[_Run, State] | None" = field(default=None, repr=False, compare=False)
@@ -56,6 +60,31 @@ class SequentialPosterior:
     def log_marginal_likelihood(self) -> float:
         """log p(y_1..y_t) of the model with its prior, estimated."""
         return float(self.log_likelihood_increments.sum())
+
+    @property
+    def log_marginal_likelihood_error(self) -> float:
+        """Its standard error, from this one run; NaN where too few families are left for one.
+
+        Samples that descend from one draw of the prior are a family. From the families' weights S_e
+        the relative variance of the evidence is (Lee and Whiteley 2018, equation 8)
+
+            1 - n / (n - 1) (m / (m - 1))^k (1 - Σ_e S_e²),
+
+        for n samples that were resampled k times to m chains; it becomes an error of the logarithm
+        as if the evidence were lognormal. With f families, the error is itself uncertain by about
+        1 / sqrt(2 f). Where fewer than ten are left, take more samples, or several runs in
+        `compare_evidence`.
+        """
+        run, _ = cast(tuple[_Run, State], self._goes_on)
+        shares = np.bincount(self.families, self.weights.astype(float))
+        num, num_moves = len(self.weights), run.sampler.num_moves
+        num_chains = num // (num_moves + 1)
+        if np.count_nonzero(shares) < _FEWEST_FAMILIES:
+            return np.nan
+        num_resampled = np.isfinite(self.acceptance_rates).sum()
+        factor = num / (num - 1) * (num_chains / (num_chains - 1)) ** num_resampled
+        variance = 1 - factor * (1 - (shares**2).sum())
+        return float(np.sqrt(np.log1p(variance))) if variance > 0 else np.nan
 
     @property
     def weights(self) -> Float[np.ndarray, " samples"]:
@@ -70,7 +99,7 @@ class SequentialPosterior:
     def filters(self) -> tuple[Problem, Series, Float[np.ndarray, " samples"]]:
         """The problem with the filters' N, the data that they have seen, and log Ẑ of each."""
         run, state = cast(tuple[_Run, State], self._goes_on)
-        samples, num_particles, _ = state.carry
+        samples, _, num_particles, _ = state.carry
         seen = jax.tree.map(lambda leaf: leaf[: state.step], run.series)
         problem = run.sampler.with_particles(num_particles).problem
         return problem, seen, np.asarray(samples.particles.log_likelihood)
@@ -85,6 +114,23 @@ class SequentialPosterior:
         draws = np.minimum(np.searchsorted(cumulative, quantiles, side="right"), num - 1)
         draws = np.random.default_rng(0).permutation(draws)
         return jax.tree.map(lambda leaf: leaf[draws][None], rows)
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """By parameter, or number of one: mean, standard deviation and quantiles.
+
+        It prints as a table.
+        """
+        numbers = numbers_of(self.parameters, 1)
+        return {name: row_of(draws, self.weights) for name, draws in numbers.items()}
+
+    def __repr__(self) -> str:
+        size = 1 / (self.weights.astype(float) ** 2).sum()
+        heading = (
+            f"{len(self.weights)} samples ({size:.0f} effective) after"
+            f" {len(self.num_particles)} observations, N = {self.num_particles[-1]}; log evidence"
+            f" {self.log_marginal_likelihood:.2f} ± {self.log_marginal_likelihood_error:.2f}"
+        )
+        return table(heading + (f"; {self.stopped}" if self.stopped else ""), self.summary())
 
     def extend(self, observations: PyTree, *, progress: bool = True) -> "SequentialPosterior":
         """The posterior after further observations: the one of all observations at once.
@@ -178,8 +224,9 @@ def smc2(
 
 @dataclass(frozen=True)
 class _Run:
-    """SMC² over some observations. It carries the samples, N and the counts of invalid densities;
-    its rows are the increment, the effective sample size, the acceptance rate and N of each step.
+    """SMC² over some observations.
+
+    It carries the samples, their families, N and the counts of invalid densities; its rows are the increment, the effective sample size, the acceptance rate and N of each step.
     """
 
     sampler: Sampler
@@ -230,12 +277,13 @@ class _Run:
             samples = eqx.filter_eval_shape(started, keys, self.sampler, reals)
             rows = (np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
             num_particles = self.sampler.problem.tree.num_particles
-            like = State(0, (samples, num_particles, before), rows)
+            num = samples.particles.log_prior.shape[0]
+            like = State(0, (samples, np.arange(num), num_particles, before), rows)
             state, stopped = run.go(like, start, self._advance)
         else:
-            before = state.carry[2]
+            before = state.carry[-1]
             state, stopped = run.go_on(state, self._advance)
-        samples, _, num_invalid = state.carry
+        samples, families, _, num_invalid = state.carry
         new = {name: count - before[name] for name, count in num_invalid.items()}
         warn_of_invalid("smc2", new)
         return SequentialPosterior(
@@ -245,13 +293,14 @@ class _Run:
             num_invalid=num_invalid,
             stopped=stopped,
             problem=self.sampler.problem,
+            families=families,
             mixtures=samples.particles.mixture,
             _goes_on=(self, state),
         )
 
     def _advance(self, step: int, last: int, carry: PyTree) -> tuple[int, PyTree, PyTree]:
         """The samples after one more observation."""
-        samples, num_particles, invalid = carry
+        samples, families, num_particles, invalid = carry
         counts, sampler = dict(invalid), self.sampler.with_particles(num_particles)
         keys = jax.random.split(jax.random.fold_in(self.key, step), 3)
         samples, *numbers = extended(keys[0], sampler, samples, jnp.asarray(step, jnp.int32))
@@ -263,7 +312,8 @@ class _Run:
             raise Broken(f"no sample has any likelihood{broken}")
         if size < _ESS_THRESHOLD * samples.num_particles:
             so_far = jnp.asarray(step + 1, jnp.int32)
-            samples, accepted, of_moves = rejuvenated(keys[1], sampler, samples, so_far)
+            samples, ancestors, *report = rejuvenated(keys[1], sampler, samples, so_far)
+            families, (accepted, of_moves) = families[np.asarray(ancestors)], report
             rate = float(accepted)
             counts = {name: count + int(of_moves[name]) for name, count in counts.items()}
             may_double = self.max_particles is not None and 2 * num_particles <= self.max_particles
@@ -276,7 +326,7 @@ class _Run:
                     samples, num_particles = with_larger, 2 * num_particles
                     increment += float(gain)
         row = (np.array([number]) for number in (increment, size, rate, num_particles))
-        return step + 1, (samples, num_particles, counts), tuple(row)
+        return step + 1, (samples, families, num_particles, counts), tuple(row)
 
 
 def _padded(series: Series, capacity: int) -> Series:

@@ -96,11 +96,11 @@ def _summary(grid, log_densities):
 
 
 @cache
-def posterior_of_a(low=-1.7, high=2.3):
+def posterior_of_a(low=-1.7, high=2.3, r=0.5):
     """By a scalar Kalman filter, in which a missing observation is none; of a in an interval."""
 
     def log_density(a):
-        model = ScalarLinear(a=a)
+        model = ScalarLinear(a=a, r=r)
         mean, variance, total = model.m, model.p**2, log_prior_of_a({"a": a})
         for y, u in zip(np.asarray(OBSERVATIONS), np.asarray(INPUTS), strict=True):
             mean, variance = a * mean + u, a**2 * variance + model.q**2

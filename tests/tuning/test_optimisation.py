@@ -2,6 +2,7 @@
 
 import warnings
 from functools import cache
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -9,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from jax.scipy.stats import norm
 
 import mpfjax
 from mpfjax import Checkpoint
 from mpfjax.exact import kalman_filter
 from mpfjax.tuning import Interval, Positive, fit, standard_errors
-from mpfjax.tuning.evidence import warn_of_bias
-from mpfjax.tuning.problem import pose
+from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
+from mpfjax.tuning.problem import pose, scores
 from tests.user_models import ScalarLinear
 
 OBSERVATIONS = jnp.array([1.5, 0.2, -0.4, 0.8, 1.9, 1.1, 0.3, -0.9])
@@ -92,6 +94,98 @@ def test_the_maximum_is_found_with_its_standard_errors():
 
 def newton(function, x):
     return x - jnp.linalg.solve(jax.hessian(function)(x), jax.grad(function)(x))
+
+
+SEVERAL = [OBSERVATIONS, OBSERVATIONS[:1], OBSERVATIONS[::-1], OBSERVATIONS + 1, 2 * OBSERVATIONS]
+STILL = optax.sgd(0.0)
+
+
+class TestPooling:
+    """Model parameters maximise Σ log mean Ẑ over seeds; a proposal's, the mean of log Ẑ."""
+
+    def test_the_gradient_weighs_the_seeds_of_a_series_by_their_likelihood(self):
+        problem = pose_evidence(small(8), SEVERAL, NOISE, {"r": Positive()})
+        reals, keys = problem.start(), jax.random.split(jax.random.key(0), 3)
+        values = lambda u: jax.vmap(lambda key: problem.objective(key, problem.at({"r": u})))(keys)  # noqa: E731
+        each, slopes = np.asarray(values(reals["r"])), np.asarray(jax.jacfwd(values)(reals["r"]))
+        weights = np.exp(each) / np.exp(each).sum(axis=0)
+        for pooled, expected in ((True, (weights * slopes).sum()), (False, slopes.sum() / 3)):
+            found, gradient = scores(keys, problem, reals, pooled)
+            np.testing.assert_allclose(found, each, rtol=1e-5)
+            assert float(gradient["r"]) == pytest.approx(expected, rel=1e-4)
+        assert np.abs(weights - 1 / 3).max() > 0.05
+
+    def test_its_value_and_the_seeds_that_count_are_those_of_each_series(self):
+        options = {"observations": SEVERAL, "optimizer": STILL, "start": {"num_particles": 4}}
+        pooled, mean = (short_fit(1, pooled=pooled, **options) for pooled in (None, False))
+        assert pooled.value > mean.value
+        assert np.argmax(pooled.effective_seeds) == 1  # of the shortest
+        assert pooled.effective_seeds.shape == (5,)
+        assert (pooled.effective_seeds <= 4.001).all()
+        np.testing.assert_array_equal(mean.effective_seeds, pooled.effective_seeds)
+
+    @pytest.mark.exactness
+    def test_by_default_a_proposal_alone_has_the_mean_of_the_logarithms(self):
+        filter = mpfjax.particle_filter(ScalarLinear(), 8, proposal=proposal())
+        options = {"filter": filter, "optimizer": STILL, "transforms": None}
+        found = short_fit(1, parameters=WEIGHTS, **options).value
+        assert found == short_fit(1, parameters=WEIGHTS, pooled=False, **options).value
+        assert found < short_fit(1, parameters=WEIGHTS, pooled=True, **options).value
+
+    def test_too_few_seeds_that_count_are_warned_of(self):
+        narrow = {"filter": mpfjax.particle_filter(ScalarLinear(r=0.03), 4, gradient="stop")}
+        with pytest.warns(UserWarning, match=r"fit: only 1\.\d of 4 seeds count .* deviation of"):
+            short_fit(2, **narrow)
+        with warnings.catch_warnings(action="error"):
+            short_fit(2, pooled=False, **narrow)
+            short_fit(2)
+
+
+class Constant(ScalarLinear):
+    """A likelihood that no state changes, so that Ẑ is exact: y_t ~ N(0, r²)."""
+
+    def log_likelihood(self, observation, states):
+        return norm.logpdf(observation, 0.0, self.r) + 0.0 * states
+
+
+class TestBatches:
+    OPTIONS: ClassVar = {
+        "filter": mpfjax.particle_filter(Constant(), 2, gradient="stop"), "batch": 2,
+        "observations": SEVERAL,
+    }  # fmt: skip
+
+    @pytest.mark.parametrize("batch", [2, 9])
+    def test_an_epoch_holds_every_series_once_and_its_mean_gradient_is_that_of_all(self, batch):
+        """Of four series of one shape and one of another: three parts, or two."""
+        num_parts, exact = {2: 3, 9: 2}[batch], sum(norm.logpdf(y, 0, 0.5).sum() for y in SEVERAL)
+        run = short_fit(4 * num_parts, optimizer=STILL, **self.OPTIONS | {"batch": batch})
+        values = run.history["value"].reshape(4, num_parts)
+        np.testing.assert_allclose(values.mean(axis=1), exact, rtol=1e-5)
+        assert run.value == pytest.approx(float(exact), rel=1e-5)
+        assert len({*map(tuple, values.round(3))}) > 1  # in another order
+        np.testing.assert_allclose(run.effective_seeds, 4, rtol=1e-5)
+        whole = short_fit(1, optimizer=optax.sgd(1e-6), **self.OPTIONS | {"batch": None})
+        epoch = short_fit(num_parts, optimizer=optax.sgd(1e-6), **self.OPTIONS | {"batch": batch})
+        moved = [np.log(run.parameters["r"] / 0.5) for run in (epoch, whole)]
+        assert moved[0] == pytest.approx(num_parts * moved[1], rel=0.05)
+
+    def test_in_the_middle_of_an_epoch_it_goes_on_where_it_was(self, tmp_path):
+        kept = self.OPTIONS | {"checkpoint": Checkpoint(tmp_path / "fit.npz")}
+        short_fit(4, **kept)
+        assert_same(short_fit(7, **kept), short_fit(7, **self.OPTIONS))
+        with pytest.raises(ValueError, match="batch is 2 there and 3 here"):
+            short_fit(7, **kept | {"batch": 3})
+
+    @pytest.mark.exactness
+    def test_standard_errors_are_of_all_series(self):
+        """Where Ẑ is exact, they are r / sqrt(2 n) at the maximum, of n observations."""
+        rows = [y.astype(float) for y in np.random.default_rng(0).normal(size=(5, 40))]
+        r = float(np.sqrt(np.mean(np.square(rows))))
+        filter = mpfjax.particle_filter(Constant(r=r), 2, gradient="stop")
+        run = short_fit(
+            1, filter=filter, observations=rows, batch=2, optimizer=STILL, curvature_seeds=4
+        )
+        assert run.standard_errors["r"] == pytest.approx(r / np.sqrt(2 * 200), rel=0.02)
 
 
 @pytest.mark.exactness

@@ -91,7 +91,7 @@ def draw(key, trajectory, observations, model):
 def by_metropolis():
     run = metropolis_hastings(KEY, FILTER, SERIES, 200, proposal_deviations=0.8, **PRIOR, **CHAINS)
     own = jax.random.wrap_key_data(run.key_data[3, 7])
-    again = run.problem.objective(own, run.problem.having({"d": run.parameters["d"][3, 7]}))
+    (again,) = run.problem.objective(own, run.problem.having({"d": run.parameters["d"][3, 7]}))
     assert float(again) == pytest.approx(run.log_marginal_likelihoods[3, 7], abs=1e-4)
     of_two = pose_evidence(FILTER, [SERIES, SERIES], OF_D["parameters"], None)
     with pytest.raises(ValueError, match="posterior: it is given several sequences"):

@@ -1,0 +1,96 @@
+"""Models compared by their evidence, with the error of its estimate."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpfjax.checks import shown
+from mpfjax.console import format_table
+from mpfjax.tuning.sequential import SequentialPosterior
+
+Runs = SequentialPosterior | Sequence[SequentialPosterior | float] | np.ndarray
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison:
+    """The evidence of several models, by name, the most likely model first."""
+
+    log_marginal_likelihoods: dict[str, float]
+    """log p(y_1..y_t) of each, estimated."""
+    errors: dict[str, float]
+    """its standard error."""
+    differences: dict[str, float]
+    """the evidence of the first less that of each: the log of their Bayes factor."""
+    difference_errors: dict[str, float]
+    """its standard error."""
+
+    @property
+    def probabilities(self) -> dict[str, float]:
+        """Of the models given the data, if all are equally probable before."""
+        weights = {name: np.exp(-d) for name, d in self.differences.items()}
+        total = sum(weights.values())
+        return {name: float(weight / total) for name, weight in weights.items()}
+
+    def __repr__(self) -> str:
+        lines = [
+            [
+                name, f"{value:.2f} ± {self.errors[name]:.2f}",
+                f"{self.differences[name]:.2f} ± {self.difference_errors[name]:.2f}",
+                f"{self.probabilities[name]:.3f}",
+            ]
+            for name, value in self.log_marginal_likelihoods.items()
+        ]  # fmt: skip
+        return format_table(["", "log evidence", "below the first", "probability"], lines)
+
+
+def compare_evidence(models: Mapping[str, Runs]) -> Comparison:
+    """Compare models by their evidence p(y_1..y_t), with the standard error of each difference.
+
+    - `models`: by name, each a posterior of `smc2`, a list of posteriors of independent runs, or
+      several estimates of log p(y_1..y_t), such as `monte_carlo(...).log_marginal_likelihood` of a
+      model without unknown parameters. All of the same observations, and each from keys of its own.
+
+    Of several runs the evidence is the mean of their estimates, since each is unbiased, and its
+    error comes from their spread; of one posterior the error is `log_marginal_likelihood_error`.
+    Differences of independent estimates add their variances. Twice the standard error covers about
+    95% if it is below one half; take more samples or more runs until it is.
+
+    Raises `ValueError` for fewer than two models, a single estimate without an error, estimates
+    that are not finite, and posteriors of different numbers of observations.
+    """
+    if not isinstance(models, Mapping) or len(models) < 2:
+        raise ValueError(f"models: {shown(models)} are not two models or more, by name")
+    lengths, found = set(), {}
+    for name, runs in models.items():
+        if isinstance(runs, SequentialPosterior):
+            found[name] = runs.log_marginal_likelihood, runs.log_marginal_likelihood_error
+            if not np.isfinite(found[name]).all():
+                raise ValueError(f"models: one run of {name} gives no error; give several runs")
+            lengths.add(len(runs.log_likelihood_increments))
+            continue
+        posteriors = [run for run in runs if isinstance(run, SequentialPosterior)]
+        lengths |= {len(run.log_likelihood_increments) for run in posteriors}
+        found[name] = _pooled(name, [getattr(run, "log_marginal_likelihood", run) for run in runs])
+    if len(lengths) > 1:
+        raise ValueError(f"models: of {sorted(lengths)} observations, not of the same")
+    order = sorted(found, key=lambda name: -found[name][0])
+    best, best_error = found[order[0]]
+    return Comparison(
+        {name: found[name][0] for name in order},
+        {name: found[name][1] for name in order},
+        {name: best - found[name][0] for name in order},
+        {name: 0.0 if name == order[0] else float(np.hypot(best_error, found[name][1]))
+         for name in order},
+    )  # fmt: skip
+
+
+def _pooled(name: str, estimates: Sequence[float]) -> tuple[float, float]:
+    """The logarithm of the mean of unbiased estimates, given by theirs, and its standard error."""
+    values = np.asarray(estimates, float)
+    if values.ndim != 1 or len(values) < 2 or not np.isfinite(values).all():
+        raise ValueError(f"models: {name} has {shown(estimates)}, not two finite estimates or more")
+    largest = values.max()
+    weights = np.exp(values - largest)
+    variance = weights.var(ddof=1) / len(values) / weights.mean() ** 2
+    return float(np.log(weights.mean()) + largest), float(np.sqrt(np.log1p(variance)))
