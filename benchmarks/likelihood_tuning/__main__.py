@@ -1,7 +1,8 @@
-"""Which gradients of a filter's likelihood can be trusted.
+"""Which gradients of a filter's likelihood can be trusted, and what `fit` learns with them.
 
-Bias, spread and time of every gradient estimator against exact scores. Run with
-`python -m benchmarks.likelihood_tuning`; `--help` lists the options.
+Bias, spread and time of every gradient estimator against exact scores; the tasks that PyDPF's
+examples publish, stochastic volatility and a linear-Gaussian model of 25 dimensions.
+Run with `python -m benchmarks.likelihood_tuning`; `--help` lists the options.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from jaxtyping import Array
 import mpfjax
 from benchmarks import harness
 from benchmarks.harness import AtLeast2, Count, Seed, command
+from benchmarks.likelihood_tuning import many_dimensions, volatility
 from benchmarks.score_vs_particles import HIGH, LOW, simulate
 from mpfjax.exact import grid_filter, kalman_filter
 
@@ -25,27 +27,54 @@ ESTIMATORS = {
     "pathwise": "stop-gradient, draws differentiated",
     "stop": "stop-gradient",
 }
+PARTS = ("gradients", "shifts", "learned", "many_dimensions", "scores")
 MODELS = {"linear_gaussian": ("a", "log q", "log r"), "quadratic": ("log σ_x", "log σ_y")}
 # Drawn once: under double precision the same key would draw another set.
 OBSERVATIONS = np.asarray(simulate(2)[1])
 
 
-@command(runs=10, particles=[20], models=["quadratic"], filters=["pf"], estimators=["stop"])
+@command(
+    runs=10, particles=[20], models=["quadratic"], filters=["pf"], estimators=["stop"],
+    series=4, data_sets=1, steps=2, dimensions=9,
+)  # fmt: skip
 def main(
     *,
+    parts: Sequence[Annotated[str, (*PARTS,)]] = PARTS,
     runs: Count = 200,
     particles: Sequence[AtLeast2] = (100, 1000),
     estimators: Sequence[Annotated[str, (*ESTIMATORS,)]] = (*ESTIMATORS,),
     models: Sequence[Annotated[str, (*MODELS,)]] = (*MODELS,),
     filters: Sequence[Literal["pf", "mpf"]] = ("pf", "mpf"),
+    series: Count = 250,
+    data_sets: Count = 10,
+    steps: Count = volatility.NUM_STEPS,
+    dimensions: Count = 25,
     seed: Seed = 0,
     out: Path = Path("results/likelihood_tuning"),
 ) -> None:
     """Cell by cell; what is finished is written.
 
+    - `parts`: scores of two models; gradients, the shift of the maximum, and learned parameters of
+      stochastic volatility; the filters in many dimensions.
     - `runs`: seeds for each estimator.
+    - `series`: of each data set of stochastic volatility.
+    - `steps`: of `fit` on each of the `data_sets`.
+    - `dimensions`: of the linear-Gaussian model.
     """
     settings = harness.settings_of(locals())
+    others = {
+        "gradients": lambda: volatility.gradients(runs, seed),
+        "shifts": lambda: volatility.shifts(series, 2, seed),
+        "learned": lambda: volatility.learned(series, data_sets, steps, seed),
+        "many_dimensions": lambda: many_dimensions.errors(dimensions, runs // 10, seed),
+    }
+    for part in parts:
+        if part != "scores":
+            title, table, entries = others[part]()
+            harness.data(out / f"{part}.json", settings=settings, results=entries)
+            print(f"{title}\n{table}\n")
+    if "scores" not in parts:
+        return
     tasks = {"linear_gaussian": linear_gaussian_task(), "quadratic": quadratic_task()}
     results = []
     for model, size, filter, estimator in harness.grid(

@@ -28,13 +28,17 @@ LENGTH = 101
 TRUTH = {"alpha": 0.91, "beta": 0.5, "sigma": 1.0}
 PARAMETERS = {name: lambda filter, name=name: getattr(filter.model, name) for name in TRUTH}
 TRANSFORMS = {"alpha": Interval(0.0, 1.0), "beta": Positive(), "sigma": Positive()}
-# Of the published tables: the spread of the score in α per observation, and mean errors.
-PUBLISHED_SPREADS = {"none": 0.035, "stop": 1.165, "marginal stop-gradient": 0.476}
+# Its tables: the spread of the score in α per observation, and the mean errors of what is learned.
 PUBLISHED = [
-    {"method": "pydpf, detached", "alpha": 0.0044, "beta": 0.040, "sigma": 0.027},
-    {"method": "pydpf, stop-gradient", "alpha": 0.0126, "beta": 0.113, "sigma": 0.049},
-    {"method": "pydpf, marginal stop-gradient", "alpha": 0.0044, "beta": 0.115, "sigma": 0.049},
+    {"method": "pydpf, detached", "deviation": 0.035,
+     "alpha": 0.0044, "beta": 0.040, "sigma": 0.027},
+    {"method": "pydpf, stop-gradient", "deviation": 1.165,
+     "alpha": 0.0126, "beta": 0.113, "sigma": 0.049},
+    {"method": "pydpf, marginal stop-gradient", "deviation": 0.476,
+     "alpha": 0.0044, "beta": 0.115, "sigma": 0.049},
 ]  # fmt: skip
+ERRORS = {name: f"{{{name}:.4f}}" for name in TRUTH}
+Table = tuple[str, str, list[dict[str, Any]]]  # its title, what it shows, and its entries
 # Of fit: the estimator of the filter, whether seeds are pooled, their number.
 METHODS = {
     "no gradient of resampling, K = 1": ("none", False, 1),
@@ -148,7 +152,7 @@ def estimated_scores(
     return jax.lax.map(of_series, (observations, keys), batch_size=64 // num_seeds)
 
 
-def gradients(runs: int, seed: int) -> list[dict[str, Any]]:
+def gradients(runs: int, seed: int) -> Table:
     """The score in α per observation, of one series at α = .93, by each method of `fit`."""
     y = jnp.asarray(simulate(1, seed))
     at = unconstrained(TRUTH | {"alpha": 0.93})
@@ -165,7 +169,12 @@ def gradients(runs: int, seed: int) -> list[dict[str, Any]]:
             "standard_error": float(values.std(ddof=1) / np.sqrt(runs)),
             "deviation": float(values.std(ddof=1)), "seconds": process_time() - start,
         })  # fmt: skip
-    return entries
+    columns = {
+        "method": "{method}", "bias": "{bias:+.4f} ± {standard_error:.4f}",
+        "deviation": "{deviation:.3f}", "CPU s": "{seconds:.1f}",
+    }  # fmt: skip
+    title = f"Score in α per observation, of one series at α = .93, exact {exact:.4f}"
+    return title, harness.table(columns, entries + PUBLISHED), entries
 
 
 def maximum(observations: Array) -> tuple[Reals, Float[np.ndarray, "3 3"]]:
@@ -185,7 +194,7 @@ def maximum(observations: Array) -> tuple[Reals, Float[np.ndarray, "3 3"]]:
     return point, hessian
 
 
-def shifts(num_series: int, repeats: int, seed: int) -> list[dict[str, Any]]:
+def shifts(num_series: int, repeats: int, seed: int) -> Table:
     """How far each method moves the exact maximum: the bias of its score there, by Newton's step.
 
     In logit α, log β and log σ, with standard errors over series and repeats.
@@ -202,11 +211,34 @@ def shifts(num_series: int, repeats: int, seed: int) -> list[dict[str, Any]]:
         entry = {"method": method, "maximum": jax.tree.map(float, constrained(point))}
         entry["shift"] = dict(zip(TRUTH, moves.mean(axis=0).tolist(), strict=True))
         entries.append(entry | {"error": dict(zip(TRUTH, error.tolist(), strict=True))})
-    return entries
+    names = {"logit α": "alpha", "log β": "beta", "log σ": "sigma"}
+    columns = {"method": "{method}"} | {
+        title: f"{{shift[{name}]:+.3f}} ± {{error[{name}]:.3f}}" for title, name in names.items()
+    }
+    return (
+        "Shift of the exact maximum by the bias of the score",
+        harness.table(columns, entries),
+        entries,
+    )
 
 
-def learned(num_series: int, method: str, steps: int, seed: int) -> dict[str, Any]:
-    """The parameters that `fit` finds on one data set, from a random start of the published task."""
+def learned(num_series: int, data_sets: int, steps: int, seed: int) -> Table:
+    """Mean errors of what `fit` learns by each method, over data sets with starts of their own."""
+    entries = [
+        learned_from(num_series, method, steps, seed + number)
+        for method, number in harness.grid("fit", METHODS, range(data_sets))
+    ]
+    rows = []
+    for method in METHODS:
+        of_method = [entry for entry in entries if entry["method"] == method]
+        means = {name: np.mean([e[name] for e in of_method]) for name in [*TRUTH, "seconds"]}
+        rows.append({"method": method} | means)
+    columns = {"method": "{method}"} | ERRORS | {"CPU s": "{seconds:.0f}"}
+    return "Mean errors of learned parameters", harness.table(columns, rows + PUBLISHED), entries
+
+
+def learned_from(num_series: int, method: str, steps: int, seed: int) -> dict[str, Any]:
+    """The parameters that `fit` finds on one data set, from a random start as published."""
     rng = np.random.default_rng([seed, 1])
     start = {"alpha": rng.uniform(), "beta": rng.uniform(0.0, 2.0), "sigma": rng.uniform(0.0, 5.0)}
     estimator, pooled, num_seeds = METHODS[method]
@@ -219,7 +251,7 @@ def learned(num_series: int, method: str, steps: int, seed: int) -> dict[str, An
             batch=min(BATCH, num_series), pooled=pooled, progress=False,
         )  # fmt: skip
     errors = {name: abs(float(run.parameters[name]) - true) for name, true in TRUTH.items()}
-    effective = float(np.mean(run.effective_seeds))
+    effective = np.asarray(run.effective_seeds).mean()
     return {"method": method, "seed": seed, "seconds": process_time() - began} | errors | {
         "effective_seeds": effective, "start": start,
     }  # fmt: skip

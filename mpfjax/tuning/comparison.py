@@ -69,9 +69,13 @@ def compare_evidence(models: Mapping[str, Runs]) -> Comparison:
                 raise ValueError(f"models: one run of {name} gives no error; give several runs")
             lengths.add(len(runs.log_likelihood_increments))
             continue
-        posteriors = [run for run in runs if isinstance(run, SequentialPosterior)]
-        lengths |= {len(run.log_likelihood_increments) for run in posteriors}
-        found[name] = _pooled(name, [getattr(run, "log_marginal_likelihood", run) for run in runs])
+        estimates = []
+        for run in runs:
+            if isinstance(run, SequentialPosterior):
+                lengths.add(len(run.log_likelihood_increments))
+                run = run.log_marginal_likelihood
+            estimates.append(float(run))
+        found[name] = _pooled(name, estimates)
     if len(lengths) > 1:
         raise ValueError(f"models: of {sorted(lengths)} observations, not of the same")
     order = sorted(found, key=lambda name: -found[name][0])

@@ -81,10 +81,11 @@ def errors_at(
 
     def score(flat: np.ndarray) -> Float[np.ndarray, "seeds d"]:
         at = unravel(jnp.asarray(flat))
-        return sum(
+        each = [
             np.concatenate([np.asarray(score_of_each(keys, part, at), float) for keys in keys_of])
             for part, keys_of in zip(problems, keys_of_problems, strict=True)
-        )
+        ]
+        return np.sum(each, axis=0)
 
     # By number, how far a step may go.
     longest = np.concatenate([

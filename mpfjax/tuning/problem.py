@@ -35,8 +35,8 @@ class Problem(eqx.Module):
 
     leaves: list[Any]
     transforms: dict[str, AbstractTransform]
-    # Of a seed and the tree that the leaves are of, a scalar, or one for each of several series that
-    # are added up; its arrays are the data.
+    # Of a seed and the tree that the leaves are of, a scalar, or one for each of several series,
+    # which are added up; its arrays are the data.
     objective: Objective
     # The parameters' names, and where they are among the leaves.
     tuned: tuple[tuple[str, int], ...] = eqx.field(static=True)

@@ -226,7 +226,8 @@ def smc2(
 class _Run:
     """SMC² over some observations.
 
-    It carries the samples, their families, N and the counts of invalid densities; its rows are the increment, the effective sample size, the acceptance rate and N of each step.
+    It carries the samples, their families, N and the counts of invalid densities. Its rows are the
+    increment, the effective sample size, the acceptance rate and N of each step.
     """
 
     sampler: Sampler

@@ -31,7 +31,7 @@ def test_requirements_have_lower_bounds_and_errors_name_extras():
     known = {re.split(r"[>=<;]", asked)[0].strip() for asked in extras}
     code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "mpfjax").rglob("*.py"))
     hints = re.findall(r'optional\("\w+", "(.+?)"\)', code)
-    assert set(hints) >= {"arviz", "trackeval"}
+    assert set(hints) >= {"trackeval"}
     assert set(hints) <= known
 
 

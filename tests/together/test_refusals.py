@@ -450,8 +450,6 @@ REFUSED = (
         for kind in (Propagate, mpfjax.PropagateMarginalised, mpfjax.Partitioned,
                      mpfjax.GaussNewtonProposal, SelectInitial)
     ),
-    ("sort_by: 9 coordinates", lambda: run_of(
-        changed(Drift, sample_initial=lambda self, key, n: jnp.zeros((n, 9))), noise="rqmc")),
     ("propagate: gradient 'stop'",
      lambda: mpfjax.PropagateNested(Propagate(gradient="stop"))),
     ("comes before any propagation: there is no x_t yet",

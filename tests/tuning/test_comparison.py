@@ -21,7 +21,9 @@ from tests.tuning.exact_posteriors import (
 def test_of_several_runs_the_evidence_is_the_mean_of_their_estimates():
     rng = np.random.default_rng(0)
     # Lognormal estimates with the mean e^3 and e^1.
-    runs = {name: m + 0.4 * rng.normal(size=2000) - 0.08 for name, m in {"b": 1.0, "a": 3.0}.items()}
+    runs = {
+        name: m + 0.4 * rng.normal(size=2000) - 0.08 for name, m in {"b": 1.0, "a": 3.0}.items()
+    }
     found = compare_evidence(runs)
     assert list(found.differences) == ["a", "b"]
     assert found.errors["a"] == pytest.approx(np.sqrt(np.exp(0.16) - 1) / np.sqrt(2000), rel=0.1)

@@ -19,13 +19,20 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped, UInt32
 from mpfjax.checks import saying, shown
 from mpfjax.mixture import ParticleMixture, points
 from mpfjax.moves.resampling.sorting import (
+    MOST_DIMENSIONS,
     bits_per_dimension,
     hilbert_index,
     order_by_key,
     order_by_segment,
     sortable_bits,
 )
-from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero, log_or_nothing
+from mpfjax.operations.logarithms import (
+    as_inexact,
+    exp,
+    finite_or_zero,
+    log_or_nothing,
+    softmax,
+)
 from mpfjax.operations.prefix_sums import (
     Positions,
     needs_units,
@@ -43,6 +50,7 @@ from mpfjax.operations.stored import cond_if_any, stored, take, whole
 
 HILBERT = "hilbert"
 SortBy = Callable[[PyTree], Array] | Literal["hilbert"]
+_NUM_PRINCIPAL = 3  # more bits of fewer coordinates order a few hundred particles better
 _STEEPNESS = 1.702  # the logistic function of this multiple is nearly the normal CDF
 
 
@@ -192,9 +200,12 @@ def sorted_order(
     """The indices of the particles by label, in [0, M], and within each label by `sort_by`.
 
     Particles are sorted by one coordinate, or along a Hilbert curve through several. Each
-    coordinate is standardised by the mean and deviation of the particle's component.
+    coordinate is standardised by the mean and deviation of the particle's component. More than 8
+    coordinates are reduced to their first principal components.
     """
     rows = _coordinates(mixture, sort_by)
+    if rows.shape[0] > MOST_DIMENSIONS:
+        rows = _principal(as_inexact(rows), mixture)
     if rows.shape[0] == 1:
         if jnp.dtype(rows.dtype).itemsize > 4:
             return jnp.lexsort((rows[0], labels)).astype(jnp.int32)
@@ -231,6 +242,18 @@ def _coordinates(mixture: ParticleMixture, sort_by: SortBy) -> Array:
             f" a few, ({n}, d)"
         )
     return jnp.asarray(values).reshape(n, -1).T
+
+
+def _principal(rows: Float[Array, "d n"], mixture: ParticleMixture) -> Float[Array, "k n"]:
+    """The first principal components of all particles, with each coordinate standardised."""
+    rows = jax.lax.stop_gradient(jnp.where(mixture.occupied[None], rows, 0.0))
+    weights = softmax(mixture.log_weights).astype(rows.dtype)[None]
+    centred = rows - jnp.sum(weights * rows, axis=1, keepdims=True)
+    variances = jnp.sum(weights * centred**2, axis=1, keepdims=True)
+    standardised = centred / jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
+    correlations = jnp.matmul(weights * standardised, standardised.T, precision="highest")
+    axes = jnp.linalg.eigh(jnp.nan_to_num(correlations))[1][:, -_NUM_PRINCIPAL:]
+    return jnp.matmul(axes.T, standardised, precision="highest")
 
 
 def _cells(

@@ -52,9 +52,11 @@ class Resample(AbstractResampling):
       components within a group. None makes no groups. Use it where components are rival hypotheses
       about several objects, so that an object with many does not take the slots of the others.
     - `sort_by`: a function that gives each particle a number, (n,), or several, (n, d). Within
-      their component the particles are resampled in the order of these numbers. Several numbers,
-      up to 8, are standardised within the component, and the order is that along a Hilbert curve
-      through them. "hilbert" takes all floating point numbers of the state. Systematic and
+      their component the particles are resampled in the order of these numbers. Several numbers
+      are standardised within the component, and the order is that along a Hilbert curve through
+      them, or of more than 8 through their first principal components. "hilbert" takes all
+      floating point numbers of the state; a function that picks those on which later observations
+      depend orders better. Systematic and
       stratified resampling in a good order change the distribution least (Kitagawa 1996). With
       the "rqmc" noise of `Propagate`, it is array randomised quasi-Monte Carlo (L'Ecuyer, Lécot
       and Tuffin 2008; Gerber and Chopin 2015). Use it where masses or likelihoods must be accurate.

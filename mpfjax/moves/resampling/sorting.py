@@ -109,16 +109,7 @@ def sortable_bits(values: Shaped[Array, " n"]) -> UInt32[Array, " n"]:
 
 
 def bits_per_dimension(dimension: int) -> int:
-    """How many bits of each coordinate fit into an index of 32 bits.
-
-    Raises `ValueError` for more than 8 dimensions: too few bits are left to tell points apart.
-    """
-    if not 1 <= dimension <= MOST_DIMENSIONS:
-        raise ValueError(
-            f"sort_by: {dimension} coordinates are not 1, ..., {MOST_DIMENSIONS}, the dimensions"
-            " that a Hilbert curve has here; give a function that returns fewer numbers, or one,"
-            ' also where "hilbert" or noise="rqmc" sorts by the whole state'
-        )
+    """How many bits of each coordinate fit into an index of 32 bits, 1 to 8 coordinates."""
     return _BITS // dimension
 
 
