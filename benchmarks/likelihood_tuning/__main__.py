@@ -35,7 +35,7 @@ OBSERVATIONS = np.asarray(simulate(2)[1])
 
 @command(
     runs=10, particles=[20], models=["quadratic"], filters=["pf"], estimators=["stop"],
-    series=4, data_sets=1, steps=2, dimensions=9,
+    series=4, data_sets=1, steps=2, dimensions=9, methods=["pooled"],
 )  # fmt: skip
 def main(
     *,
@@ -45,6 +45,7 @@ def main(
     estimators: Sequence[Annotated[str, (*ESTIMATORS,)]] = (*ESTIMATORS,),
     models: Sequence[Annotated[str, (*MODELS,)]] = (*MODELS,),
     filters: Sequence[Literal["pf", "mpf"]] = ("pf", "mpf"),
+    methods: Sequence[Annotated[str, (*volatility.METHODS,)]] = (*volatility.METHODS,),
     series: Count = 250,
     data_sets: Count = 10,
     steps: Count = volatility.NUM_STEPS,
@@ -57,15 +58,16 @@ def main(
     - `parts`: scores of two models; gradients, the shift of the maximum, and learned parameters of
       stochastic volatility; the filters in many dimensions.
     - `runs`: seeds for each estimator.
+    - `methods`: of `fit`, on stochastic volatility.
     - `series`: of each data set of stochastic volatility.
     - `steps`: of `fit` on each of the `data_sets`.
     - `dimensions`: of the linear-Gaussian model.
     """
     settings = harness.settings_of(locals())
     others = {
-        "gradients": lambda: volatility.gradients(runs, seed),
-        "shifts": lambda: volatility.shifts(series, 2, seed),
-        "learned": lambda: volatility.learned(series, data_sets, steps, seed),
+        "gradients": lambda: volatility.gradients(methods, runs, seed),
+        "shifts": lambda: volatility.shifts(methods, series, 2, seed),
+        "learned": lambda: volatility.learned(methods, series, data_sets, steps, seed),
         "many_dimensions": lambda: many_dimensions.errors(dimensions, runs // 10, seed),
     }
     for part in parts:
