@@ -20,25 +20,31 @@ class Comparison:
     """log p(y_1..y_t) of each, estimated."""
     errors: dict[str, float]
     """its standard error."""
-    differences: dict[str, float]
-    """the evidence of the first less that of each: the log of their Bayes factor."""
-    difference_errors: dict[str, float]
-    """its standard error."""
+
+    @property
+    def differences(self) -> dict[str, float]:
+        """The evidence of the first less that of each: the log of their Bayes factor."""
+        best = max(self.log_marginal_likelihoods.values())
+        return {name: best - value for name, value in self.log_marginal_likelihoods.items()}
+
+    @property
+    def difference_errors(self) -> dict[str, float]:
+        """Their standard errors."""
+        first, *others = self.errors
+        best = self.errors[first]
+        return {first: 0.0} | {name: float(np.hypot(best, self.errors[name])) for name in others}
 
     @property
     def probabilities(self) -> dict[str, float]:
         """Of the models given the data, if all are equally probable before."""
-        weights = {name: np.exp(-d) for name, d in self.differences.items()}
-        total = sum(weights.values())
-        return {name: float(weight / total) for name, weight in weights.items()}
+        weights = np.exp([-difference for difference in self.differences.values()])
+        return dict(zip(self.errors, (weights / weights.sum()).tolist(), strict=True))
 
     def __repr__(self) -> str:
         lines = [
-            [
-                name, f"{value:.2f} ± {self.errors[name]:.2f}",
-                f"{self.differences[name]:.2f} ± {self.difference_errors[name]:.2f}",
-                f"{self.probabilities[name]:.3f}",
-            ]
+            [name, f"{value:.2f} ± {self.errors[name]:.2f}",
+             f"{self.differences[name]:.2f} ± {self.difference_errors[name]:.2f}",
+             f"{self.probabilities[name]:.3f}"]
             for name, value in self.log_marginal_likelihoods.items()
         ]  # fmt: skip
         return format_table(["", "log evidence", "below the first", "probability"], lines)
@@ -79,14 +85,8 @@ def compare_evidence(models: Mapping[str, Runs]) -> Comparison:
     if len(lengths) > 1:
         raise ValueError(f"models: of {sorted(lengths)} observations, not of the same")
     order = sorted(found, key=lambda name: -found[name][0])
-    best, best_error = found[order[0]]
-    return Comparison(
-        {name: found[name][0] for name in order},
-        {name: found[name][1] for name in order},
-        {name: best - found[name][0] for name in order},
-        {name: 0.0 if name == order[0] else float(np.hypot(best_error, found[name][1]))
-         for name in order},
-    )  # fmt: skip
+    values, errors = ({name: found[name][k] for name in order} for k in (0, 1))
+    return Comparison(values, errors)
 
 
 def _pooled(name: str, estimates: Sequence[float]) -> tuple[float, float]:
