@@ -130,6 +130,23 @@ def test_particles_of_a_component_stand_near_their_neighbours(sort_by):
     assert (np.diff(sorted_.component_indicators) >= 0).all()
 
 
+def test_many_coordinates_are_sorted_along_the_first_principal_ones():
+    """25 numbers that two others make, in units of their own, and with an empty slot."""
+    rng = np.random.default_rng(0)
+    causes = rng.normal(size=(400, 2))
+    states = causes @ rng.normal(size=(2, 25)) + 0.05 * rng.normal(size=(400, 25))
+    states, log_weights = states * 10.0 ** np.arange(-12, 13), np.zeros(400)
+    states[7], log_weights[7] = np.nan, -np.inf
+    mixture = make_mixture(states, log_weights, np.zeros(400, int), 1)
+    ancestors = np.asarray(resampled(mixture, "hilbert").ancestor_indices)
+    assert 7 not in ancestors
+
+    def way(order):
+        return np.linalg.norm(np.diff(causes[order], axis=0), axis=1).sum()
+
+    assert way(ancestors) < 0.3 * way(np.sort(ancestors))
+
+
 def test_standardised_coordinates_make_units_immaterial():
     rng = np.random.default_rng(1)
     states, labels = rng.normal(size=(200, 3)), rng.integers(0, 6, 200)
