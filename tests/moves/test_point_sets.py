@@ -144,7 +144,8 @@ def test_many_coordinates_are_sorted_along_the_first_principal_ones():
     def way(order):
         return np.linalg.norm(np.diff(causes[order], axis=0), axis=1).sum()
 
-    assert way(ancestors) < 0.3 * way(np.sort(ancestors))
+    # 1 without the sorting; the third component is noise, which lengthens the way.
+    assert way(ancestors) < 0.4 * way(np.sort(ancestors))
 
 
 def test_standardised_coordinates_make_units_immaterial():
