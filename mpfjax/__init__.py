@@ -106,18 +106,18 @@ from mpfjax.transforms import with_start as with_start
 __version__ = "0.1.0"
 
 # Imported when they are first asked for: a first filter needs none of them, nor their optax.
-_LATER = {name: name for name in ("exact", "metrics", "tuning")} | {"robots": "models.robots"}
+_LATER = ("exact", "metrics", "robots", "tuning")
 
 if TYPE_CHECKING:
     from mpfjax import exact as exact
     from mpfjax import metrics as metrics
+    from mpfjax import robots as robots
     from mpfjax import tuning as tuning
-    from mpfjax.models import robots as robots
 else:  # hidden from type checkers, to which it would say that every name is there
 
     def __getattr__(name):
         if name in _LATER:
-            return _importlib.import_module(f"{__name__}.{_LATER[name]}")
+            return _importlib.import_module(f"{__name__}.{name}")
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -92,7 +92,7 @@ def as_numbers(
 def _check_differences(name: str, array: Any) -> None:
     """Raise a `ValueError` for numbers that differ from one step to the next by what float32 loses.
 
-    They are large, or a long series that goes one way: whatever else differs by so little is a
+    They are large, or a long series that goes somewhere: whatever else differs by so little is a
     rounding error itself, as in times between observations. Of what is in float32 already, the gaps
     between such numbers stand for what was lost.
     """
@@ -117,8 +117,12 @@ def _check_differences(name: str, array: Any) -> None:
         lost = np.nanmean(np.abs(rows.astype(np.float32) - rows), axis=0)
         if is_rounded:
             lost = np.where(sizes >= _EXACT, 0.25 * np.spacing(sizes.astype(np.float32)), 0.0)
-    goes_one_way = (len(rows) >= 8) & ~((steps > 0).any(axis=0) & (steps < 0).any(axis=0))
-    is_lost = (apart > 0) & (lost > 0.01 * apart) & ((sizes > _FAR) | goes_one_way)
+    # A walk goes farther than its steps, which rounding errors about a constant do not.
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        extent = np.nanmax(rows, axis=0) - np.nanmin(rows, axis=0)
+    walks = (len(rows) >= 8) & (extent >= 6.99 * apart)
+    is_lost = (apart > 0) & (lost > 0.01 * apart) & ((sizes > _FAR) | walks)
     if is_lost.any():
         at = int(np.argmax(is_lost))
         near = f"numbers near {sizes[at]:.10g} that differ by {apart[at]:.2g}"
@@ -132,6 +136,27 @@ def _array(value: Any) -> Any:
     of_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
     with contextlib.suppress(TypeError, ValueError, OverflowError):
         return jnp.asarray(value) if of_jax else np.asarray(value)
+
+
+def check_spacing(name: str, places: Any, scale: Any, of_what: str) -> None:
+    """Raise a `ValueError` for places that float32 cannot tell apart on their own scale.
+
+    `scale` is a length for all or each of them, such as the side of a cell, a radius or a standard
+    deviation, in words `of_what`: twenty numbers of float32 must lie within it.
+    """
+    parts = (places, scale)
+    default = jax.dtypes.canonicalize_dtype(np.float64)
+    if default == np.float64 or any(isinstance(part, Tracer) for part in parts):
+        return
+    far, near = np.broadcast_arrays(*(np.asarray(part, float) for part in parts))
+    with np.errstate(over="ignore", invalid="ignore"):
+        spacing = np.spacing(np.abs(far).astype(np.float32))
+    is_coarse = (near > 0) & (spacing > 0.05 * near)
+    if is_coarse.any():
+        at = int(np.argmax(is_coarse))
+        place, gap, side = (float(part.ravel()[at]) for part in (far, spacing, near))
+        what = f"near {place:.10g} numbers of float32 are {gap:.2g} apart, and {of_what} {side:.3g}"
+        raise ValueError(f"{name}: {what}; subtract an origin first, or set jax_enable_x64")
 
 
 def _array_of_numbers(name: str, value: Any, may_be_complex: bool = False) -> Any:

@@ -14,7 +14,6 @@ MODULES = (
     "robots",
     "mpfjax",
 )  # the top last
-PLACES = {"mpfjax": "mpfjax", "robots": "mpfjax.models.robots"}  # of those that stand elsewhere
 
 
 @cache
@@ -27,7 +26,7 @@ def public_names() -> dict[str, str]:
     shown: dict[int, str] = {}
     for name in MODULES:
         full = name if name == "mpfjax" else f"mpfjax.{name}"
-        module = importlib.import_module(PLACES.get(name, full))
+        module = importlib.import_module(full)
         for each in _public_in(module):
             target = shown.setdefault(id(getattr(module, each)), f"{full}.{each}")
             found[f"{full}.{each}"] = found[f"{name}.{each}"] = target

@@ -8,10 +8,12 @@ from typing import Annotated
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import FINITE, POSITIVE, Fitting, to_array
+from mpfjax.checks import FINITE, POSITIVE, Fitting, check_spacing, to_array
 from mpfjax.operations.random import normal, split, uniform
 
 Rate = Annotated[Float[Array, ""], POSITIVE]
@@ -43,6 +45,11 @@ class Box(Fitting):
     low: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("low"))
     high: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("high"))
 
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        if not isinstance(self.high, Tracer) and not isinstance(self.low, Tracer):
+            check_spacing("high", self.high, np.subtract(self.high, self.low), "the box has")
+
     def sample(self, key: Key[Array, ""], num_places: int) -> Float[Array, "n d"]:
         """Draw places evenly."""
         shares = uniform(key, (num_places, self.low.shape[0]), self.low.dtype)
@@ -59,6 +66,10 @@ class Disc(Fitting):
 
     centre: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("centre"))
     radius: Annotated[Float[Array, ""], POSITIVE] = eqx.field(converter=to_array("radius"))
+
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        check_spacing("centre", self.centre, self.radius, "the radius is")
 
     def sample(self, key: Key[Array, ""], num_places: int) -> Float[Array, "n d"]:
         """Draw places evenly."""

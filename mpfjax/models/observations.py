@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree
 
 from mpfjax.checks import as_numbers, check, check_shape, warn
-from mpfjax.models.base import model_name, takes_inputs
+from mpfjax.models.base import innermost, model_name, takes_inputs
 from mpfjax.models.law import law_of
 
 
@@ -87,6 +87,11 @@ def steps_of_inputs(
     if own_length != length:
         raise ValueError(f"inputs: their t is {own_length}, and that of the {of_what} is {length}")
     usable = _steps_where(arrays, "all", _USABLE[NOT_FINITE])
+    inspect = getattr(innermost(model), "check_inputs", None)
+    if inspect is not None and not any(
+        isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arrays)
+    ):
+        inspect(arrays)
     return refused_where(~usable, arrays, f"inputs: {NOT_FINITE}")
 
 

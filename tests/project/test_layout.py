@@ -8,8 +8,14 @@ from tests.bugs import BUGS
 PACKAGE = Path(__file__).resolve().parents[2] / "mpfjax"
 # From the ground up: each part may import from those above it here, and from itself.
 ORDER = """
+<<<<<<< HEAD
     checks operations memory mixture models moves report filter running lookahead
     transforms filters smoothing console exact metrics vision tuning plotting command __main__
+=======
+    checks operations mixture models moves report filter running lookahead
+    transforms filters smoothing console exact metrics vision robots tuning plotting command
+    __main__
+>>>>>>> 95ac1b39 (robots: a folder; one rule for cells, rays by borders, beams, files, degrees)
 """
 # Inside the folders that hold several floors: files, and folders.
 FLOORS = {
@@ -22,6 +28,7 @@ FLOORS = {
     """,
     "vision": "files colour tracking boxes",
     "lookahead": "quadratics pilot twisted regression learned",
+    "robots": "maps motion sensors localisation pose",
     "running": "storage long_runs devices scan run late islands studies",
 }
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")

@@ -10,7 +10,6 @@ import mpfjax
 from mpfjax import transforms
 from mpfjax.moves.base import AbstractMove
 
-PLACES = {"mpfjax.robots": "mpfjax.models.robots"}
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 # Their first arguments are in the order of DESIGN's interface, or are data and no settings.
 BY_POSITION = {
@@ -34,6 +33,13 @@ DIFFERENT = {
     "exponent",  # of a likelihood; of a distance
     "first",  # of a folder's frames, the first; of a tracker's, that of the detections
     "frames_per_second",  # of a tracker None asks; a video that is written must have one
+<<<<<<< HEAD
+=======
+    "inflation",  # weights correct a proposal's, and nothing that of a Gaussian regeneration
+    "least_existence",  # below which an object ends; from which it is shown
+    "min_distance",  # of poses None leaves none out; of components that are split, zero
+    "num_draws",  # of a particle's proposals; of a smoothed term's ancestors
+>>>>>>> 95ac1b39 (robots: a folder; one rule for cells, rays by borders, beams, files, degrees)
     "num_iterations",  # of Newton, of K-means from seeds, and within one component
     "num_moves",  # of states at each step; of parameters, which must cross their posterior
     "num_seeds",  # an estimate's gradient, a function that need not be random, a matrix
@@ -52,7 +58,7 @@ def public():
     names = importlib.import_module("api_names").public_names()
     for full in sorted(set(names.values())):
         module, _, name = full.rpartition(".")
-        value = getattr(importlib.import_module(PLACES.get(str(module), str(module))), name)
+        value = getattr(importlib.import_module(str(module)), name)
         methods = vars(value).items() if inspect.isclass(value) else ()
         if not (inspect.isclass(value) and issubclass(value, tuple)):
             yield name, arguments_of(value)

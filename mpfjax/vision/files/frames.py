@@ -189,19 +189,31 @@ def _natural(path: Path) -> tuple[list[Any], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
-def _read_images(folder: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
-    from PIL import Image, ImageOps
+def read_image(path: Path, mode: str) -> UInt8[np.ndarray, "h w channels"]:
+    """The pixels of an image, rotated as its file says, in a mode of Pillow, "RGB" or "RGBA".
 
+    Images with 16 bits of grey are read as of eight. Raises `ValueError` for a file that cannot be
+    read, and for numbers of more bits, or of floating point.
+    """
+    image_module, operations = optional("PIL.Image", "pillow"), optional("PIL.ImageOps", "pillow")
+    with _naming(path, "an image"), image_module.open(path) as opened:
+        image = operations.exif_transpose(opened)
+        if image.mode.startswith("I"):
+            numbers = np.asarray(image)
+            if numbers.min() < 0 or numbers.max() > 65535:
+                raise ValueError("its grey has more than 16 bits")
+            image = image_module.fromarray((numbers // 257).astype(np.uint8))
+        if image.mode == "F":
+            raise ValueError("its grey is in floating point")
+        return np.array(image.convert(mode))
+
+
+def _read_images(folder: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
     paths = _image_paths(folder)
     if first > len(paths):
         raise ValueError(f"{folder}: holds {len(paths)} images, frame {first} is not among them")
     for path in paths[first - 1 : last]:
-        with _naming(path, "an image"), Image.open(path) as opened:
-            image = ImageOps.exif_transpose(opened)
-            if image.mode.startswith("I"):  # 16 bits of grey
-                image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
-            frame = np.array(image.convert("RGB"))
-        yield frame
+        yield read_image(path, "RGB")
 
 
 def _read_video(

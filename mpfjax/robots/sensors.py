@@ -1,0 +1,199 @@
+"""Laser scanners: p(scan | pose, map), by distances to walls or by ranges along beams."""
+
+import abc
+from typing import Annotated, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr
+from jaxtyping import Array, Bool, Float
+
+from mpfjax.checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Count,
+    Exponent,
+    Fitting,
+    NotNegative,
+    Positive,
+    check_shape,
+    entries,
+    to_array,
+    to_numbers,
+    warn,
+)
+from mpfjax.models.gaussians import log_normal
+from mpfjax.robots.maps import Angles, Beams, OccupancyGrid, Poses, ends_of
+
+Weight = Annotated[Float[Array, ""], NOT_NEGATIVE]
+Scale = Annotated[Float[Array, ""], POSITIVE]
+
+# The independent beams that a scan is worth, whatever their number, and those beyond which a
+# scan is too sharp for the particles of a filter.
+_INDEPENDENT, _SHARP = 10, 30
+_TURN = 2 * np.pi + 0.01
+_WHAT = "finite and within ±2π, in radians: np.deg2rad(...)"
+RADIANS = entries(lambda angles: np.abs(angles) <= _TURN, _WHAT)
+# A pose: x and y are any numbers.
+POSE = entries(
+    lambda pose: np.isfinite(pose).all() and abs(pose[-1]) <= _TURN,
+    "a pose, finite, whose heading is within ±2π, in radians: np.deg2rad(...)",
+)
+
+
+class AbstractLaser(Fitting):
+    """A planar scanner: p(scan | pose, map) is the product over its beams, to a power.
+
+    - `angles`: of the beams of a scan, (k,), counted from the scanner's own heading: `angle_min +
+      angle_increment * arange(k)` of ROS's `LaserScan`, in radians.
+    - `laser_max_range`: metres; a beam of this range or more met nothing, also an infinite one.
+    - `laser_min_range`: metres; a beam up to it counts as one that met nothing, as in AMCL.
+    - `max_beams`: how many are used, evenly spaced among those that say anything.
+    - `exponent`: the power. Beams share the errors of the map and of the pose, so that their
+      product is far too sharp. None takes 10 over the number of beams that are used, at most 1: a
+      scan is then worth ten independent beams.
+    - `mount`: pose of the scanner in the robot's frame.
+    - `z_hit`, `z_rand`: weights of a beam that ends where the map says, and of any range at all;
+      all weights are divided by their sum.
+    - `sigma_hit`: the standard deviation of the first in metres.
+
+    A scan is (k,), in metres; beams that are NaN are left out, and so are those of -inf, which met
+    something too near to be measured (REP 117). Raises `ValueError` for angles beyond ±2π, and
+    warns where an exponent makes a scan worth more than thirty independent beams: few particles of
+    a diffuse prior survive it.
+    """
+
+    angles: Annotated[Float[Array, " k"], RADIANS] = eqx.field(converter=to_array("angles"))
+    laser_max_range: Positive = eqx.field(static=True, kw_only=True)
+    laser_min_range: NotNegative = eqx.field(static=True, kw_only=True, default=0.0)
+    max_beams: Count = eqx.field(static=True, kw_only=True, default=60)
+    exponent: Exponent | None = eqx.field(static=True, kw_only=True, default=None)
+    mount: Annotated[tuple[float, ...], POSE] = eqx.field(
+        static=True, kw_only=True, converter=to_numbers("mount"), default=(0.0, 0.0, 0.0)
+    )
+    z_hit: Weight = eqx.field(kw_only=True, converter=to_array("z_hit"), default=0.5)
+    z_rand: Weight = eqx.field(kw_only=True, converter=to_array("z_rand"), default=0.5)
+    sigma_hit: Scale = eqx.field(kw_only=True, converter=to_array("sigma_hit"), default=0.2)
+
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        worth = (self.exponent or 0.0) * min(self.max_beams, len(self.angles))
+        if worth > _SHARP:
+            what = f"a scan is worth {worth:.3g} independent beams, and beams share errors"
+            warn(f"exponent: with {self.exponent:g} {what}; None is worth {_INDEPENDENT}")
+
+    def log_likelihood(
+        self, scan: Float[Array, " k"], poses: Poses, grid: OccupancyGrid
+    ) -> Float[Array, " n"]:
+        """log p of a scan at each pose of the robot, up to a constant."""
+        check_shape(str(len(self.angles)), observation=scan)
+        met = (scan > self.laser_min_range) & (scan < self.laser_max_range)
+        usable = self.usable(scan, met)
+        angles, scan, met, is_used = self._spaced(usable, self.angles, scan, met)
+        forward, left, turn = self.mount
+        cos, sin = jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2])
+        steps = [cos * forward - sin * left, sin * forward + cos * left, jnp.full_like(cos, turn)]
+        ranges = jnp.where(met, scan, self.laser_max_range)
+        logs = self.log_beams(ranges, poses + jnp.stack(steps, axis=1), angles, grid)
+        return self.log_scan(jnp.where(is_used[None], logs, -jnp.inf), is_used)
+
+    def usable(self, scan: Float[Array, " k"], met: Bool[Array, " k"]) -> Bool[Array, " k"]:
+        """Which beams say anything."""
+        return ~jnp.isnan(scan) & (scan != -jnp.inf)
+
+    def log_scan(self, logs: Beams, is_used: Bool[Array, " b"]) -> Float[Array, " n"]:
+        """log p of the scan, from those of its beams; those that are not used have -inf."""
+        total = jnp.sum(jnp.where(is_used[None], logs, 0.0), axis=1)
+        if self.exponent is not None:
+            return self.exponent * total
+        return (
+            jnp.minimum(1.0, _INDEPENDENT / jnp.maximum(jnp.sum(is_used).astype(total.dtype), 1.0))
+            * total
+        )
+
+    def _spaced(self, usable: Bool[Array, " k"], *values: Array) -> list[Array]:
+        """The values of at most `max_beams` usable beams, evenly spaced, and which are any."""
+        most = min(self.max_beams, len(self.angles))
+        if most == len(self.angles):
+            return [*values, usable]
+        upto, rank = jnp.cumsum(usable, dtype=jnp.int32), jnp.arange(most, dtype=jnp.int32)
+        gap = (upto[-1].astype(float) - 1) / max(most - 1, 1)
+        spaced = jnp.round(rank.astype(float) * gap).astype(jnp.int32)
+        wanted = jnp.where(upto[-1] > most, spaced, rank)
+        at = jnp.clip(jnp.searchsorted(upto, wanted + 1), 0, len(self.angles) - 1)
+        return [*(value[at] for value in values), rank < upto[-1]]
+
+    @abc.abstractmethod
+    def log_beams(self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid) -> Beams:
+        """log p of each beam from each pose of the scanner; one that met nothing has the most."""
+
+
+class LikelihoodField(AbstractLaser):
+    """Beams end near a wall: Thrun, Burgard and Fox (2005), table 6.3.
+
+        p = z_hit N(d; 0, sigma_hit²) + z_rand / laser_max_range
+
+    with d from the end of the beam to the nearest edge of a wall, and
+    `laser_likelihood_max_dist` where that is less, or the end is off the map. Beams that met
+    nothing say nothing, and others are used in their place.
+
+    - `weighting`: "product" of p to the power `exponent`, or AMCL's "cubes": 1 + Σ p³, without the
+      factor 1 / (sigma_hit √(2π)) and the sum of the weights. Cubes are no likelihood: a scan then
+      hardly tells poses apart, and hypotheses and their masses follow no probability.
+
+    It is smooth, and takes a look-up per beam: use it first, and `AbstractLaser` says what its
+    other parameters are. It does not know that a beam cannot pass a wall.
+    """
+
+    laser_likelihood_max_dist: Positive = eqx.field(static=True, kw_only=True, default=2.0)
+    weighting: Literal["product", "cubes"] = eqx.field(static=True, kw_only=True, default="product")
+
+    def usable(self, scan: Float[Array, " k"], met: Bool[Array, " k"]) -> Bool[Array, " k"]:
+        """Which beams met anything."""
+        return met
+
+    def log_beams(self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid) -> Beams:
+        """By the distance of each beam's end to the nearest edge of a wall."""
+        gaps = grid.at(ends_of(poses, angles, ranges[None]), grid.distances, jnp.inf)
+        hit = jnp.exp(log_normal(jnp.minimum(gaps, self.laser_likelihood_max_dist), self.sigma_hit))
+        rest, total = self.z_rand / self.laser_max_range, self.z_hit + self.z_rand
+        if self.weighting == "cubes":
+            hit, total = hit * self.sigma_hit * np.sqrt(2 * np.pi), 1.0
+        return jnp.log((self.z_hit * hit + rest) / total)
+
+    def log_scan(self, logs: Beams, is_used: Bool[Array, " b"]) -> Float[Array, " n"]:
+        """log p of the scan, by the weighting."""
+        if self.weighting == "product":
+            return super().log_scan(logs, is_used)
+        return jnp.log1p(jnp.sum(jnp.exp(3 * logs), axis=1))
+
+
+class BeamModel(AbstractLaser):
+    """Beams end at the first wall: Thrun, Burgard and Fox (2005), table 6.1.
+
+        p = z_hit N(z; z*, sigma_hit²) + z_short lambda_short exp(-lambda_short z) 1(z <= z*)
+            + z_max 1(z = laser_max_range) + z_rand / laser_max_range 1(z < laser_max_range)
+
+    with z* the range that the map says, and the first two normalised on [0, laser_max_range] and
+    [0, z*]. `z_short` is the weight of what stands before the wall, people say, and `z_max` that of
+    beams that met nothing. `AbstractLaser` says what its other parameters are.
+
+    Use it where several places have walls at the same distances, but in other directions, or behind
+    other walls, with a map that is `tabulated`: it takes no longer than `LikelihoodField` then.
+    """
+
+    z_short: Weight = eqx.field(kw_only=True, converter=to_array("z_short"), default=0.005)
+    z_max: Weight = eqx.field(kw_only=True, converter=to_array("z_max"), default=0.05)
+    lambda_short: Scale = eqx.field(kw_only=True, converter=to_array("lambda_short"), default=0.1)
+
+    def log_beams(self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid) -> Beams:
+        """By the range to the first occupied cell."""
+        most, expected = self.laser_max_range, grid.ranges(poses, angles, self.laser_max_range)
+        inside = ndtr((most - expected) / self.sigma_hit) - ndtr(-expected / self.sigma_hit)
+        hit = jnp.exp(log_normal(ranges[None] - expected, self.sigma_hit)) / inside
+        rate, wall = self.lambda_short, jnp.maximum(expected, grid.resolution / 2)
+        short = rate * jnp.exp(-rate * ranges)[None] / -jnp.expm1(-rate * wall)
+        of_map = self.z_hit * hit + self.z_short * jnp.where(ranges[None] <= expected, short, 0.0)
+        density = of_map + jnp.where(ranges < most, self.z_rand / most, self.z_max)[None]
+        return jnp.log(density / (self.z_hit + self.z_short + self.z_max + self.z_rand))
