@@ -70,7 +70,7 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
     periods = np.array([0.0, 0.0, 2 * np.pi])
 
     def __init__(
-        self, grid: OccupancyGrid, motion: Any, sensor: Any, *, clearance: float = 0.0,
+        self, grid: Any, motion: Any, sensor: Any, *, clearance: float = 0.0,
         initial_pose: Any = None, initial_deviations: Any = (0.5, 0.5, np.pi / 12),
         inputs: Any = None,
     ) -> None:  # fmt: skip

@@ -66,7 +66,7 @@ class OccupancyGrid(Fitting):
         far = np.add(self.origin, resolution * np.array(walls.shape[::-1]))
         corners = np.stack([self.origin, far])
         check_spacing("origin", corners, resolution, "the side of a cell is")
-        edges = walls & ~binary_erosion(walls, np.ones((3, 3), bool))
+        edges = walls & ~np.asarray(binary_erosion(walls, np.ones((3, 3))), bool)
         self.distances = jnp.asarray(resolution * np.asarray(distance_transform_edt(~edges)), float)
 
     def cells(self, places: Float[Array, "*n 2"]) -> tuple[Array, Array, Array]:

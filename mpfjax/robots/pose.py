@@ -51,7 +51,7 @@ def localised(mixture: ParticleMixture, radius: Positive = 1.0) -> Float[Array, 
     return jnp.sum(jnp.where(_near(mixture, radius), mixture.weights, 0.0))
 
 
-def _near(mixture: ParticleMixture, radius: float) -> Array:
+def _near(mixture: ParticleMixture, radius: Any) -> Array:
     means, heaviest = mixture.component_means(), jnp.argmax(mixture.mixture_weights)
     away = mixture.particles[:, :2] - means[heaviest, None, :2]
     return jnp.hypot(away[:, 0], away[:, 1]) < radius
@@ -94,7 +94,7 @@ def _next_log_odds(log_odds: Any, evidence: Any, probability: float) -> Any:
 
 
 @eqx.filter_jit
-def _summary(mixture: ParticleMixture, radius: float) -> tuple[Array, ...]:
+def _summary(mixture: ParticleMixture, radius: Array) -> tuple[Array, ...]:
     """Pose, covariance, the mass near the heaviest mean, and the components, which of them far."""
     near, weights = _near(mixture, radius), mixture.weights
     mass = jnp.where(near, weights, 0.0)

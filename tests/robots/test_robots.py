@@ -217,6 +217,111 @@ def test_map_of_an_image(tmp_path, monkeypatch):
         robots.read_map(tmp_path / "plan.png", resolution=0.5)
 
 
+def test_usable_beams_are_spaced_evenly():
+    """Of 283 beams with a return among 720 sixty are used, with every second one missing too."""
+    angles = jnp.linspace(-3.0, 3.0, 720)
+    scan = np.full(720, np.inf, np.float32)
+    scan[200:483] = 1.0 + 0.001 * np.arange(283)
+    sensor = robots.LikelihoodField(angles, laser_max_range=MOST)
+    usable = sensor.usable(jnp.asarray(scan), jnp.asarray(scan < MOST))
+    at, is_used = sensor._spaced(usable, jnp.arange(720))
+    assert is_used.all()
+    assert at.tolist() == (200 + np.linspace(0, 282, 60).round()).astype(int).tolist()
+    holed = np.where(np.arange(720) % 2, 1.5, np.nan).astype(np.float32)
+    whole = robots.LikelihoodField(angles[1::2], laser_max_range=MOST)
+    expected = whole.log_likelihood(jnp.asarray(holed[1::2]), POSES, GRID)
+    assert sensor.log_likelihood(jnp.asarray(holed), POSES, GRID) == pytest.approx(expected)
+    few = np.full(720, np.nan, np.float32)
+    few[[5, 300, 301]] = 1.2
+    three = robots.LikelihoodField(angles[np.array([5, 300, 301])], laser_max_range=MOST)
+    expected = three.log_likelihood(jnp.full(3, 1.2), POSES, GRID)
+    assert sensor.log_likelihood(jnp.asarray(few), POSES, GRID) == pytest.approx(expected)
+
+
+def test_too_near_is_not_nothing():
+    """REP 117: -inf is a beam that met something too near to be measured."""
+    sensor = robots.BeamModel(ANGLES, laser_max_range=MOST)
+    near = sensor.log_likelihood(SCAN.at[2].set(-jnp.inf), POSES, GRID)
+    left_out = sensor.log_likelihood(SCAN.at[2].set(jnp.nan), POSES, GRID)
+    assert near == pytest.approx(left_out)
+
+
+def test_an_exponent_of_many_beams_is_a_warning():
+    angles = jnp.linspace(-1.0, 1.0, 60)
+    with pytest.warns(RuntimeWarning, match="exponent: with 1 a scan is worth 60"):
+        robots.LikelihoodField(angles, laser_max_range=MOST, exponent=1.0)
+    scan = jnp.full(60, 1.5)
+    by_default = robots.LikelihoodField(angles, laser_max_range=MOST)
+    tenth = robots.LikelihoodField(angles, laser_max_range=MOST, exponent=1 / 6)
+    expected = tenth.log_likelihood(scan, POSES, GRID)
+    assert by_default.log_likelihood(scan, POSES, GRID) == pytest.approx(expected)
+
+
+def test_cubes_are_those_of_amcl():
+    sensor = robots.LikelihoodField(
+        ANGLES, laser_likelihood_max_dist=0.8, weighting="cubes", **SHARED, **WEIGHTS
+    )
+    for pose, found in zip(PLACES, sensor.log_likelihood(SCAN, POSES, GRID), strict=True):
+        (x, y, heading), weight = scanner(pose), 1.0
+        for z, angle in beams():
+            if z < MOST:
+                ends = x + z * np.cos(heading + angle), y + z * np.sin(heading + angle)
+                weight += (0.7 * np.exp(-(gap(*ends) ** 2) / (2 * 0.15**2)) + 0.2 / MOST) ** 3
+        assert found == pytest.approx(np.log(weight), rel=1e-4)
+
+
+def test_a_robot_is_in_no_wall_and_may_be_where_the_map_is_unknown():
+    """Free, unknown, occupied, off the map."""
+    poses = jnp.array([[0.5, 2.55, 0], [-0.5, 4.65, 0], [1.2, 3.0, 0], [9.0, 3.0, 0]])
+    logs = np.asarray(robot().log_likelihood(SCAN, poses))
+    assert np.isfinite(logs).tolist() == [True, True, False, False]
+    exact = robots.OdometryMotion(alpha1=1e-4, alpha2=1e-4, alpha3=1e-4, alpha4=1e-4)
+    model = robots.RobotModel(
+        GRID, exact, robot().sensor, initial_pose=(1.24, 2.7, np.pi / 2),
+        initial_deviations=(0.01, 0.01, 0.01),
+    )  # fmt: skip
+    filter = mpfjax.particle_filter(model, 100)
+    mixture = filter.init(jax.random.key(0))
+    for forward, is_degenerate in ((0.3, True), (0.0, False)):
+        step = jnp.array([forward, 0.0, 0.0])
+        info = filter.step(jax.random.key(1), mixture, SCAN, inputs=step)[1]
+        assert bool(info.degenerate) == is_degenerate
+
+
+@pytest.mark.parametrize(
+    ("pose", "what"),
+    [((9.0, 3.0, 0.0), "off the map"), ((1.2, 3.0, 0.0), "in an occupied cell"),
+     ((0.5, 2.55, 90.0), "radians"), ((0.5, 2.55, np.nan), "finite")],
+)  # fmt: skip
+def test_an_initial_pose_that_cannot_be_is_refused(pose, what):
+    with pytest.raises(ValueError, match=f"initial_pose: .*{what}"):
+        robot(initial_pose=pose)
+
+
+def test_degrees_and_arrays_of_a_map_are_refused():
+    with pytest.raises(ValueError, match=r"angles: .*radians"):
+        robots.LikelihoodField(jnp.arange(360.0), laser_max_range=MOST)
+    with pytest.raises(ValueError, match=r"mount: .*radians"):
+        robots.LikelihoodField(ANGLES, laser_max_range=MOST, mount=(0.1, 0.0, 180.0))
+    sensor = robots.LikelihoodField(ANGLES, laser_max_range=MOST)
+    with pytest.raises(ValueError, match="grid: "):
+        robots.RobotModel(WALLS, robots.OdometryMotion(), sensor)
+    with pytest.raises(ValueError, match="motion: "):
+        robots.RobotModel(GRID, sensor, sensor)
+    with pytest.raises(ValueError, match="sensor: "):
+        robots.RobotModel(GRID, robots.OdometryMotion(), robots.OdometryMotion())
+
+
+def test_poses_in_place_of_steps_are_a_warning(recwarn):
+    turn = np.linspace(0, 3, 20)
+    poses = np.stack([np.sin(turn), 3.2 - np.cos(turn), turn], axis=1)
+    scans, filter = np.tile(SCAN, (19, 1)), mpfjax.particle_filter(robot(), 10)
+    mpfjax.run_filter(jax.random.key(0), filter, scans, inputs=robots.odometry_steps(poses))
+    assert not any("odometry_steps" in str(each.message) for each in recwarn)
+    with pytest.warns(RuntimeWarning, match="inputs: they look like poses"):
+        mpfjax.run_filter(jax.random.key(0), filter, scans, inputs=poses[1:])
+
+
 def test_refusals():
     with pytest.raises(ValueError, match="occupied"):
         robots.OccupancyGrid(np.zeros((2, 2), bool), resolution=CELL)
