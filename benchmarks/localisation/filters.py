@@ -1,8 +1,9 @@
 """What is compared: plain filters, AMCL, a peer, the mixture, and the mixture with restarts."""
 
 import importlib.util
+import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,8 @@ from jaxtyping import Array, Float, Int, Key
 
 import mpfjax
 from benchmarks.peers.libraries import blackjax_steps
+from mpfjax import robots
+from mpfjax.models.base import replaced
 
 PEER = "blackjax, bootstrap filter"
 
@@ -83,6 +86,21 @@ class AdaptiveMonteCarlo(mpfjax.AbstractPropagation):
         return jnp.where(jnp.any(is_enough), jnp.argmax(is_enough) + 1, most).astype(jnp.int32)
 
 
+def as_amcl(model: Any) -> Any:
+    """The model as AMCL weighs scans: by cubes of its likelihood field, of all beams.
+
+    The ring has no laser, and keeps its likelihood.
+    """
+    laser = getattr(model, "sensor", None)
+    if not isinstance(laser, robots.AbstractLaser):
+        return model
+    field = robots.LikelihoodField(
+        laser.angles, laser_max_range=laser.laser_max_range, z_hit=laser.z_hit,
+        z_rand=laser.z_rand, sigma_hit=laser.sigma_hit, weighting="cubes",
+    )  # fmt: skip
+    return replaced(model, sensor=field)
+
+
 def replace_some(
     key: Key[Array, ""], mixture: mpfjax.ParticleMixture, now: mpfjax.Step
 ) -> mpfjax.ParticleMixture:
@@ -104,7 +122,7 @@ FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
     "replacing 1%": lambda model, n, m: mpfjax.Filter(
         model, [mpfjax.Resample(), replace_some, mpfjax.Propagate()], n
     ),
-    "AMCL": lambda model, n, m: mpfjax.Filter(model, [AdaptiveMonteCarlo()], 5000),
+    "AMCL": lambda model, n, m: mpfjax.Filter(as_amcl(model), [AdaptiveMonteCarlo()], 5000),
     "mixture": mixture,
     "mixture, with_restarts": lambda model, n, m: mpfjax.with_restarts(mixture(model, n, m)),
     "mixture, with_start": lambda model, n, m: mpfjax.with_start(mixture(model, n, m)),
@@ -118,18 +136,54 @@ FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
 NAMES = [*FILTERS, *([PEER] if importlib.util.find_spec("blackjax") else [])]
 
 
-def traced(mixture: mpfjax.ParticleMixture) -> tuple[Array, Array]:
-    """What is kept of a step."""
-    return mixture.particles, mixture.log_weights
+class Trace(NamedTuple):
+    """What is kept of the steps of runs, (runs, t, ...)."""
+
+    particles: Array
+    log_weights: Array
+    localised: Array | np.ndarray
+    averages: Array | np.ndarray
+    """The logarithms of w_slow and w_fast, of AMCL."""
 
 
-def run(name: str, model: Any, size: int, components: int, keys: Array, given: Any) -> Any:
-    """Of each run and step on (observations, inputs): particles, log-weights, log Ẑ's increment."""
+def run(
+    name: str, model: Any, size: int, components: int, keys: Array, series: Any, near: float
+) -> tuple[Trace, Any, Any]:
+    """Traces of runs on (observations, inputs), log Ẑ's increments, and "lost", (runs, t), if any.
+
+    "Lost" is the probability of `robots.lost` for filters with an alarm, and AMCL's own measure,
+    1 - w_fast / w_slow.
+    """
     if name == PEER:
-        return _through_blackjax(model, size)(keys, given)
+        particles, logs, increments = _through_blackjax(model, size)(keys, series)
+        return Trace(particles, logs, np.empty(0), np.empty(0)), increments, None
+
+    def traced(mixture: mpfjax.ParticleMixture) -> Trace:
+        averages = mixture.memory.get("averages", jnp.zeros(2))
+        localised = robots.localised(mixture, near)
+        return Trace(mixture.particles, mixture.log_weights, localised, averages)
+
     filter = FILTERS[name](model, size, components)
-    runs = mpfjax.monte_carlo(keys, filter, mpfjax.Series(*given), traced)
-    return *runs.collected, runs.log_likelihood_increments
+    runs = mpfjax.monte_carlo(keys, filter, mpfjax.Series(*series), traced)
+    trace, lost = runs.collected, None
+    if name == "AMCL":
+        lost = -np.expm1(np.minimum(trace.averages[..., 1] - trace.averages[..., 0], 0.0))
+    elif runs.log_evidence_against_start is not None:
+        lost = robots.lost(trace.localised, runs.log_evidence_against_start)
+    return trace, runs.log_likelihood_increments, lost
+
+
+def milliseconds(name: str, model: Any, size: int, components: int, series: Any) -> float | None:
+    """Of a scan, in the second of two runs."""
+    if name == PEER:
+        return None
+    filter, data = FILTERS[name](model, size, components), mpfjax.Series(*series)
+    seconds = []
+    for seed in range(2):
+        began = time.perf_counter()
+        mpfjax.run_filter(jax.random.key(seed), filter, data).final.particles.block_until_ready()
+        seconds.append(time.perf_counter() - began)
+    return 1e3 * seconds[-1] / data.length
 
 
 def _through_blackjax(model: Any, size: int) -> Callable[..., Any]:

@@ -178,14 +178,30 @@ def drawn(
     return scene._replace(drives=[each._replace(seen=abs(each.seen)) for each in scene.drives])
 
 
-def turtlebot(seed: int, steps: int | None) -> Scene:
-    """TurtleBot3's world, nearly six-fold symmetric, and random drives of 50 steps."""
+def amcl(seed: int, steps: int | None) -> Scene:
+    """TurtleBot3's world with AMCL's sensor: 60 beams all around, its weights and deviation."""
+    grid, errors = turtlebot_map(), Errors(range=0.02, most=3.5)
+    sensor = robots.LikelihoodField(2 * np.pi * np.arange(60) / 60, laser_max_range=errors.most)
+    model = robots.RobotModel(grid, GivenDeviations(), sensor, clearance=0.12)
+
+    def ranges(poses: Array) -> Array:
+        return grid.ranges(poses, sensor.angles, errors.most)
+
+    return simulated(model, ranges, errors, seed, lambda rng: wander(model, steps or 20, rng))
+
+
+def turtlebot_map() -> robots.OccupancyGrid:
+    """The part of the map that is known."""
     grid = robots.read_map(MAP, resolution=0.05)
     rows, columns = np.nonzero(grid.free | grid.occupied)
     part = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-    grid = robots.OccupancyGrid(grid.occupied[part], grid.free[part], resolution=0.05)
+    return robots.OccupancyGrid(grid.occupied[part], grid.free[part], resolution=0.05)
+
+
+def turtlebot(seed: int, steps: int | None) -> Scene:
+    """TurtleBot3's world, nearly six-fold symmetric, and random drives of 50 steps."""
     errors = Errors(range=0.1, most=3.5)
-    return drawn(grid, errors, seed, lambda model, rng: wander(model, steps or 50, rng))
+    return drawn(turtlebot_map(), errors, seed, lambda model, rng: wander(model, steps or 50, rng))
 
 
 def wander(model: robots.RobotModel, steps: int, rng: np.random.Generator) -> np.ndarray:
@@ -288,8 +304,24 @@ def ring(seed: int, steps: int | None) -> Scene:
     return simulated(model, model.ranges, errors, seed, lambda rng: path)
 
 
+def with_people(scene: Scene, share: float, seed: int) -> Scene:
+    """The scene with people who cover this share of the beams, side by side, in each scan.
+
+    They are between the scanner and the wall, at another place in each scan.
+    """
+
+    def covered(drive: Stretch, number: int) -> Stretch:
+        rng, (length, beams) = np.random.default_rng([seed, number, 1]), drive.seen.shape
+        first = rng.integers(beams, size=(length, 1))
+        is_person = (np.arange(beams) - first) % beams < round(share * beams)
+        nearer = drive.seen * rng.uniform(0.1, 0.9, (length, 1))
+        return drive._replace(seen=np.where(is_person, nearer, drive.seen))
+
+    return scene._replace(drives=[covered(each, k) for k, each in enumerate(scene.drives)])
+
+
 # By name: those whose data are there, and those that always are.
 SCENES: dict[str, Callable[[int, int | None], Scene]]
 SCENES = {name: partial(building, name) for name in LOGS}
-SCENES |= {"turtlebot": turtlebot} if MAP.is_file() else {}
+SCENES |= {"turtlebot": turtlebot, "amcl": amcl} if MAP.is_file() else {}
 SCENES |= {name: partial(rooms, name) for name in ROOMS} | {"ring": ring}

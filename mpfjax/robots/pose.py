@@ -4,7 +4,6 @@ from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
@@ -60,8 +59,8 @@ def _near(mixture: ParticleMixture, radius: Any) -> Array:
 @checked
 def lost(
     localised: Any, log_evidence_against_start: Any, probability: InnerShare = 1e-3
-) -> Float[Array, " t"]:
-    """The probability that the robot is not where the heaviest hypothesis says, at each step, (t,).
+) -> Float[np.ndarray, "*runs t"]:
+    """The probability that the robot is not where the heaviest hypothesis says, at each step.
 
         lost_t = 1 - localised_t (1 - q_t),   q_t / (1 - q_t) = o_t,
         o_t = (o_{t-1} + p) p(y_t | x ~ p_0) / p(y_t | y_1..y_{t-1}),   o_0 = p
@@ -69,22 +68,24 @@ def lost(
     q is the probability that all hypotheses are wrong, from the evidence that the alarm compares,
     as of a change at an unknown time (Shiryaev 1963); its odds are at most e^10.
 
-    - `localised`: the share of the mass at the heaviest hypothesis, (t,), see `localised`.
-    - `log_evidence_against_start`: that of the run, or of the report of each step, (t,), of a
-      filter with an alarm or restarts.
+    - `localised`: the share of the mass at the heaviest hypothesis, (t,) or (runs, t), see
+      `localised`.
+    - `log_evidence_against_start`: that of the run, or of the report of each step, of a filter with
+      an alarm or restarts, of the same shape.
     - `probability`: p, that a robot is carried away between two scans.
 
-    Use it to stop a robot, or to let it look around: below .5 the pose is probably right.
+    Use it to stop a robot, or to let it look around: below .5 the pose is probably right. Raises
+    `ValueError` for arrays of different shapes.
     """
-    odds, result = jnp.log(probability), []
     shares, evidences = np.asarray(localised, float), np.asarray(log_evidence_against_start, float)
-    if shares.ndim != 1 or shares.shape != evidences.shape:
+    if not shares.ndim or shares.shape != evidences.shape:
         shapes = f"{shares.shape} and {evidences.shape}"
         raise ValueError(f"localised, log_evidence_against_start: {shapes} are not (t,) both")
-    for share, evidence in zip(shares, evidences, strict=True):
-        odds = _next_log_odds(odds, evidence, probability)
-        result.append(1 - share * jax.nn.sigmoid(-odds))
-    return jnp.asarray(result)
+    log_odds, doubts = np.full(shares.shape[:-1], np.log(probability)), []
+    for evidence in np.moveaxis(evidences, -1, 0):
+        log_odds = _next_log_odds(log_odds, evidence, probability)
+        doubts.append(log_odds)
+    return 1 - np.minimum(shares, 1.0) / (1 + np.exp(np.stack(doubts, axis=-1)))
 
 
 def _next_log_odds(log_odds: Any, evidence: Any, probability: float) -> Any:
