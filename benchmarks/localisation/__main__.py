@@ -133,7 +133,8 @@ def follow(
     if rooms and not rooms.pillar:
         carried = len(drives[0].poses)
         at = np.minimum([carried - 1, carried - 1 + LATER], len(poses) - 1)
-        masses = rooms.masses(particles[:, at], np.exp(logs[:, at]))
+        states = np.asarray(particles[:, at])
+        masses = rooms.masses(states, np.exp(logs[:, at]))
     return Found(np.asarray(right), np.asarray(log_z, float), masses, lost)
 
 
