@@ -32,11 +32,9 @@ class AdaptiveMonteCarlo(mpfjax.AbstractPropagation):
     slow, fast = 0.001, 0.1
     bins = (0.5, 0.5, np.pi / 18)
 
-    def initial_memory(
-        self, model: mpfjax.AbstractStateSpaceModel, num_components: int
-    ) -> dict[str, Any]:
+    def initial_memory(self, now: mpfjax.Step, num_components: int) -> dict[str, Any]:
         """The logarithms of w_slow and w_fast."""
-        del model, num_components
+        del now, num_components
         return {"averages": jnp.full(2, -jnp.inf)}
 
     def __call__(

@@ -8,14 +8,9 @@ from tests.bugs import BUGS
 PACKAGE = Path(__file__).resolve().parents[2] / "mpfjax"
 # From the ground up: each part may import from those above it here, and from itself.
 ORDER = """
-<<<<<<< HEAD
     checks operations memory mixture models moves report filter running lookahead
-    transforms filters smoothing console exact metrics vision tuning plotting command __main__
-=======
-    checks operations mixture models moves report filter running lookahead
     transforms filters smoothing console exact metrics vision robots tuning plotting command
     __main__
->>>>>>> 95ac1b39 (robots: a folder; one rule for cells, rays by borders, beams, files, degrees)
 """
 # Inside the folders that hold several floors: files, and folders.
 FLOORS = {

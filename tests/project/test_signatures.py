@@ -33,13 +33,7 @@ DIFFERENT = {
     "exponent",  # of a likelihood; of a distance
     "first",  # of a folder's frames, the first; of a tracker's, that of the detections
     "frames_per_second",  # of a tracker None asks; a video that is written must have one
-<<<<<<< HEAD
-=======
-    "inflation",  # weights correct a proposal's, and nothing that of a Gaussian regeneration
-    "least_existence",  # below which an object ends; from which it is shown
     "min_distance",  # of poses None leaves none out; of components that are split, zero
-    "num_draws",  # of a particle's proposals; of a smoothed term's ancestors
->>>>>>> 95ac1b39 (robots: a folder; one rule for cells, rays by borders, beams, files, degrees)
     "num_iterations",  # of Newton, of K-means from seeds, and within one component
     "num_moves",  # of states at each step; of parameters, which must cross their posterior
     "num_seeds",  # an estimate's gradient, a function that need not be random, a matrix
