@@ -265,7 +265,7 @@ def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: 
     """Raise a `ValueError` that names a move after which particles have no single parents."""
     for move in all_of(moves):
         if not move.keeps_parents:
-            which = f"one parent x_(t-1), which {needed_by} needs (a state that begins anew has none)"
+            which = f"one parent x_(t-1), which {needed_by} needs (restarts leave none)"
             raise ValueError(f"{argument}: {name_of(move)} leaves no particle {which}")
 
 

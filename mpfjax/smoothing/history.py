@@ -42,7 +42,7 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
 def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:
     """The mixtures; an error where a particle comes from no single one of the step before."""
     is_orphan = (mixtures.ancestor_indices < 0) & (mixtures.log_weights > -jnp.inf)
-    what = "follows ancestors, and particles of negative index have no single one, as after restarts"
+    what = "follows ancestors, and particles of index below 0 have no single one, as after restarts"
     return refused_where(jnp.any(is_orphan[1:]), mixtures, f"mixtures: {needed_by} {what}")
 
 
@@ -91,9 +91,9 @@ def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
 
     `mixtures` is a run of `run_filter(..., collect=None)`, whose first time is then x_0, or the
     mixtures that it collected, whose first time is x_1. Raises `ValueError` for anything else, and
-    where particles have no single ancestors, as after restarts (a negative index; RuntimeError within jit).
-    Use it to see how far back the history of a mode goes. Resampling leaves few ancestors at early
-    times; `sample_trajectories` draws new ones.
+    where particles have no single ancestors, as after restarts (an index below 0; RuntimeError
+    within jit). Use it to see how far back the history of a mode goes. Resampling leaves few
+    ancestors at early times; `sample_trajectories` draws new ones.
     """
     return _trace(with_parents(mixtures_of(mixtures), "trace_ancestors"))
 

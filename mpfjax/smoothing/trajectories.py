@@ -70,9 +70,9 @@ def sample_trajectories(
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
     that is not there or dead, a run with restarts, and for "mcmc" where particles have no single
-    ancestors (a negative index; both a RuntimeError within jit); a RuntimeError where no particle can have
-    moved to the next. If the backward weights degenerate, so that at some time fewer than a tenth
-    of the trajectories are distinct, a RuntimeWarning names the share. Use it for estimates
+    ancestors (an index below 0; both a RuntimeError within jit); a RuntimeError where no particle
+    can have moved to the next. If the backward weights degenerate, so that at some time fewer than
+    a tenth of the trajectories are distinct, a RuntimeWarning names the share. Use it for estimates
     of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but has few
     distinct states at early times.
     """
