@@ -59,7 +59,7 @@ def test_a_label_that_dies_within_and_is_used_again_has_no_past():
     )
     every = Every(1, [Merge(None, max_distance=1.0, patience=2), Split(1.0)])
     durations = jnp.array([[5, 5, 0], [5, 5, 0], [0, 0, 5]], jnp.int32)
-    memory = every.initial_memory(MODEL, 3) | {"overlap_durations": durations}
+    memory = every.initial_memory(mpfjax.Step(MODEL), 3) | {"overlap_durations": durations}
     after = every(KEYS[0], mixture.replace(memory=memory))
     np.testing.assert_array_equal(np.unique(after.component_indicators), [0, 1, 2])
     assert after.memory["overlap_durations"][0, 1] == 0
@@ -89,7 +89,7 @@ def test_a_move_that_holds_moves_forwards_all_that_they_are():
         assert not getattr(move, name), name
     mixture = mpfjax.ParticleMixture(
         jnp.arange(4.0), jnp.full(4, -jnp.log(4.0)), jnp.arange(4) % 2, jnp.arange(4), 3,
-        memory=move.initial_memory(MODEL, 3),
+        memory=move.initial_memory(mpfjax.Step(MODEL), 3),
     )  # fmt: skip
     assert "odd" in mixture.memory
     now = mpfjax.Step(MODEL, jnp.float32(1.0))
@@ -112,6 +112,6 @@ def test_particles_in_order_come_through():
     """Both branches have one form, whatever moved the particles before."""
     mixture = single_component(jnp.arange(6.0), 2).at_step().with_order(True)
     filter = mpfjax.Filter(MODEL, [Propagate(), Every(2, [RandomLabels()])], 6, 2)
-    memory = filter.moves[1].initial_memory(MODEL, 2)
+    memory = filter.moves[1].initial_memory(mpfjax.Step(MODEL), 2)
     moved = filter.moves[1](KEYS[0], mixture.replace(memory=memory), None)
     np.testing.assert_array_equal(moved.particles, mixture.particles)

@@ -125,7 +125,7 @@ class TestMerge:
     def test_patience_counts_steps_in_a_row(self):
         near, far = clouds([[0.0], [0.1]], [30, 30]), clouds([[0.0], [50.0]], [30, 30])
         merge = Merge(2.0, patience=3)
-        memory = merge.initial_memory(MODEL, 6)
+        memory = merge.initial_memory(mpfjax.Step(MODEL), 6)
         merged = []
         for mixture in (near, near, far, near, near, near, near):
             moved = eqx.filter_jit(merge)(KEY, mixture.replace(memory=memory))
