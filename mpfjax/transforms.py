@@ -145,7 +145,7 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
 
 def _own_lookahead(filter: Filter) -> Lookahead:
     """The look-ahead of the proposal by which the filter draws x_t, or of the model alone."""
-    proposals = [getattr(move, "proposal", None) for move in all_of(filter.moves)]
+    proposals: list[Any] = [getattr(move, "proposal", None) for move in all_of(filter.moves)]
     known = [proposal for proposal in proposals if hasattr(proposal, "log_normaliser")]
     return known[0] if known else PilotLookahead()
 
