@@ -159,7 +159,7 @@ class LogJoint(eqx.Module):
 
     def __call__(self, trajectory: PyTree, filter: Filter) -> Float[Array, ""]:
         """With the parameters of the filter's model."""
-        model: Any = filter.model
+        model = law_of(filter.model).model
         start = jax.tree.map(lambda leaf: leaf[:1], trajectory)
         after = jax.tree.map(lambda leaf: leaf[1:], trajectory)
 

@@ -415,7 +415,7 @@ OTHERS: dict[str, Callable] = {
     "trajectories": backward(),
     "trajectories, mcmc": backward(method="mcmc", num_moves=8),
     "sums": sums(),
-    "sums, mcmc": sums(method="mcmc", num_draws=4),
+    "sums, mcmc": sums(method="mcmc"),
     "genealogy": genealogy,
     "conditional filter": conditional,
     "Metropolis": metropolis,

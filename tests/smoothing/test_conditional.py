@@ -33,7 +33,7 @@ CASES = {
     "many components, sorted, of fixed number": (
         chain(
             Resample("stratified", particles_per_component=2, sort_by=lambda x: -x),
-            Predict(), Reweight(), RandomPartition(4), n=11, m=5,
+            Predict(), Reweight(), RandomPartition(), n=11, m=5,
         ),
         False,
     ),

@@ -8,7 +8,7 @@ import pickle
 
 import pytest
 
-MODULES = ("mpfjax", "mpfjax.models.robots", "mpfjax.tuning", "mpfjax.smoothing", "mpfjax.exact",
+MODULES = ("mpfjax", "mpfjax.robots", "mpfjax.tuning", "mpfjax.smoothing", "mpfjax.exact",
            "mpfjax.vision", "mpfjax.smoothing.variance", "mpfjax.tuning.metropolis",
            "mpfjax.tuning.gibbs", "mpfjax.tuning.sequential")  # fmt: skip
 PUBLIC = {

@@ -98,8 +98,7 @@ class AdaptAppearance(AbstractPropagation):
         """Learn from this frame, unless it is missing."""
         if is_missing(now):
             return mixture
-        model: Any = now.model
-        particles = model.learned(now.observation, mixture.particles, self.rate)
+        particles = now.model.learned(now.observation, mixture.particles, self.rate)
         return mixture.replace(particles=particles)
 
 

@@ -86,8 +86,12 @@ class HSVColours(AbstractColours):
         colour = _bin(hue, self.num_hues) * self.num_saturations
         colour += _bin(saturation, self.num_saturations)
         grey = self.num_hues * self.num_saturations + _bin(value, self.num_values)
-        xp: Any = np if isinstance(frame, np.ndarray) else jnp
-        return xp.where(coloured, colour, grey)[:, :, None]
+        return _numpy_of(frame).where(coloured, colour, grey)[:, :, None]
+
+
+def _numpy_of(frame: Any) -> Any:
+    """NumPy for its own arrays, JAX's for others."""
+    return np if isinstance(frame, np.ndarray) else jnp
 
 
 def hue_saturation_value(
@@ -98,7 +102,7 @@ def hue_saturation_value(
     Hue runs from red at 0 through green at 1/3 and blue at 2/3; it is 0 where there is no colour.
     By NumPy where the frame is an array of it, without compiling anything.
     """
-    xp: Any = np if isinstance(frame, np.ndarray) else jnp
+    xp = _numpy_of(frame)
     red, green, blue = (frame[:, :, i].astype(xp.float32) for i in range(3))
     high = xp.maximum(xp.maximum(red, green), blue)
     chroma = high - xp.minimum(xp.minimum(red, green), blue)

@@ -36,7 +36,7 @@ class OpticalFlow:
     """
 
     def __init__(self) -> None:
-        self._cv2: Any = opencv()
+        self._cv2 = opencv()
         self._before: np.ndarray | None = None
         self._boxes = np.zeros((0, 4))
 
@@ -107,7 +107,7 @@ def reduced(frame: np.ndarray, factor: int) -> np.ndarray:
     """The means over squares of pixels, so many along each side."""
     if factor == 1:
         return frame
-    cv2: Any = opencv()
+    cv2 = opencv()
     size = max(frame.shape[1] // factor, 1), max(frame.shape[0] // factor, 1)
     return cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
 
