@@ -15,6 +15,7 @@ from mpfjax.checks import Checked, check, is_series, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.law import Law, law_of
+from mpfjax.models.noise import Noise
 from mpfjax.operations.random import split
 
 Gradient = Literal["none", "stop"]
@@ -35,7 +36,7 @@ class Step(eqx.Module):
     """the filter's own chain."""
     initial_moves: "Moves" = eqx.field(default=(), kw_only=True)
     """those of x_0."""
-    initial_noise: str = eqx.field(static=True, default="independent", kw_only=True)
+    initial_noise: Noise = eqx.field(static=True, default="independent", kw_only=True)
     """what x_0 is made of."""
     is_initial: bool = eqx.field(static=True, default=False, kw_only=True)
     """whether it is x_0 that is moved, with y_1 for an observation, if that is known."""

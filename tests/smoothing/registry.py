@@ -73,7 +73,7 @@ def _online(**options):
 
 def _stepwise(key, filter, observations, inputs=None):
     """The terms at t - L, and after the last step those that are left; NaN is missing."""
-    smoother = FixedLagSmoother(filter, statistics_for(filter.model), LAG, "mcmc", 3)
+    smoother = FixedLagSmoother(filter, statistics_for(filter.model), LAG, "mcmc")
     key, *keys = jax.random.split(key, 1 + len(observations))
     window, rows, increments = smoother.init(filter.init(key)), [], []
     for t, seen in enumerate(np.asarray(observations)):
