@@ -119,7 +119,7 @@ BUGS = {
         "tests/metrics/test_set_distances.py -k ospa",
     ),
     "objects move against the camera": Bug(
-        "vision/tracking/tracker.py",
+        "vision/tracking/step.py",
         "objects = state.objects.shifted(shift)",
         "objects = state.objects.shifted(-shift)",
         "tests/vision/test_tracker.py -k shaking",

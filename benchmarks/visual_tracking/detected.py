@@ -15,10 +15,11 @@ from benchmarks.visual_tracking.following import Snapshot
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractPropagation
 from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
-from mpfjax.vision.tracking.detections import Found
+from mpfjax.vision.tracking.detections import FrameDetections
 from mpfjax.vision.tracking.gaussian import Gaussian, places_of, units
+from mpfjax.vision.tracking.step import WEAK_ERROR, advanced
 from mpfjax.vision.tracking.track import offline_rows
-from mpfjax.vision.tracking.tracker import WEAK_ERROR, advanced, coloured
+from mpfjax.vision.tracking.tracker import coloured
 
 MAX_DETECTIONS, MAX_OBJECTS, PARTICLES = 32, 24, 16
 # Weights within a component differ by at most the factor e^30.
@@ -148,7 +149,7 @@ class Decider:
         self.tracker = ObjectTracker(MAX_OBJECTS)
         self.state, self.seats = self.tracker.init(), dict[int, int]()  # by identity
 
-    def decide(self, moments: Gaussian, found: Found) -> tuple[Tracks, Seen]:
+    def decide(self, moments: Gaussian, found: FrameDetections) -> tuple[Tracks, Seen]:
         """The tracks, a row for each component, and what its particles need of them."""
         own = [self.seats[name] for name in self.state.lives.identities.tolist()]
         state = self.state._replace(objects=moments.at(np.array(own, int)))
@@ -170,7 +171,7 @@ class Decider:
         tracks = tracks._replace(**filled)
         return tracks, self._seen(tracks, found, born)
 
-    def _seen(self, tracks: Tracks, found: Found, born: np.ndarray) -> Seen:
+    def _seen(self, tracks: Tracks, found: FrameDetections, born: np.ndarray) -> Seen:
         noises, there = self.state.noise.noises, tracks.detections >= 0
         rows = np.argmax(found.rows == tracks.detections[:, None], axis=1) if len(found.rows) else 0
         boxes = np.where(there[:, None], np.append(found.boxes, np.ones((1, 4)), axis=0)[rows], 1.0)
@@ -211,7 +212,9 @@ def follow_detected(
     mixtures = jax.vmap(filter.init)(keys)
     for t, still in enumerate(stills):
         boxes = Detections(detector.detect(still)[:MAX_DETECTIONS])
-        found = coloured(Found.of(boxes, f"detections: frame {t + 1}", still.shape[:2]), still)
+        found = coloured(
+            FrameDetections.of(boxes, f"detections: frame {t + 1}", still.shape[:2]), still
+        )
         means = jax.tree.map(np.asarray, _moments(mixtures))
         of_runs = (Gaussian(*rows) for rows in zip(*means, strict=True))
         decided = [each.decide(one, found) for one, each in zip(of_runs, deciders, strict=True)]

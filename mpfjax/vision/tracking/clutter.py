@@ -21,10 +21,11 @@ class Clutter(NamedTuple):
     number: float = 1.0
     frames: float = 1.0
 
-    def after(self, points: Float[np.ndarray, "d 2"], number: int) -> "Clutter":
-        """With a frame's points, so many of them of nobody."""
-        told = np.concatenate([self.corners, points])
-        corners = np.array([told.min(axis=0), told.max(axis=0)]) if len(told) else told
+    def after(self, places: Float[np.ndarray, "d k"], number: int) -> "Clutter":
+        """With a frame's detections, so many of them of nobody."""
+        corners = np.concatenate([self.corners, places[:, :2]])
+        if len(corners):
+            corners = np.array([corners.min(axis=0), corners.max(axis=0)])
         return Clutter(corners, KEPT * self.number + number, KEPT * self.frames + 1)
 
     @property

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from mpfjax.checks import shown, to_numbers, to_rows, warn
 from mpfjax.vision.files.boxes import centred
 from mpfjax.vision.tracking.gaussian import places_of
+from mpfjax.vision.tracking.kinds import BOXES, Kind
 
 # Why a detection cannot be tracked, in the order in which it is asked.
 FAULTS: tuple[str, ...] = ("not finite", "of no area", "outside the frame")
@@ -62,14 +63,14 @@ class Detections(NamedTuple):
         return made._replace(classes=made.classes.astype(int))
 
 
-class Found(NamedTuple):
+class FrameDetections(NamedTuple):
     """The detections of a frame that can be tracked, the strongest first, equal ones by area.
 
     - `boxes`: (d, 4), centre and size in pixels; or (d, 2), points in deviations.
     - `scores`, `classes`: (d,), a class of 0 for none.
     - `rows`: (d,), the row of each in what the detector gave.
     - `extent`: left, top, right, bottom of the frame; infinite where not known.
-    - `left_out`: (3,), how many cannot be tracked, by `FAULTS`; `told`: what to say of each.
+    - `left_out`: (3,), how many cannot be tracked, by `FAULTS`; `warnings`: the first of each.
     - `colours`: (d, bins), None without pixels; `vectors`: (d, e), None where nobody gave them.
     """
 
@@ -79,20 +80,20 @@ class Found(NamedTuple):
     rows: Int[np.ndarray, " d"]
     extent: Float[np.ndarray, "4"]
     left_out: Int[np.ndarray, "3"]
-    told: tuple[str, ...]
+    warnings: tuple[str, ...]
     colours: Float[np.ndarray, "d bins"] | None = None
     vectors: Float[np.ndarray, "d e"] | None = None
 
     @classmethod
     def of(
         cls,
-        found: Detections,
+        detections: Detections,
         named: str,
         frame_size: tuple[int, int] | None,
-        deviation: float | None = None,
-    ) -> "Found":
-        """Leave out what cannot be tracked, and count it. `deviation`: of the errors of points."""
-        rows, scores, classes, vectors = found
+        kind: Kind = BOXES,
+    ) -> "FrameDetections":
+        """Leave out what cannot be tracked, and count it."""
+        rows, scores, classes, vectors = detections
         boxes = np.asarray(rows, float)
         scores = np.ones(len(rows)) if scores is None else scores
         keep = np.ones(len(rows), bool)
@@ -100,37 +101,37 @@ class Found(NamedTuple):
         if frame_size is not None:
             extent = np.array([0, 0, frame_size[1], frame_size[0]], float)
         with np.errstate(invalid="ignore"):
-            far = boxes[:, :2] + (0.0 if deviation else boxes[:, 2:])
+            far = boxes[:, :2] + (boxes[:, 2:] if kind.has_boxes else 0.0)
             sound = (
                 np.isfinite(boxes).all(axis=1) & np.isfinite(scores),
                 (boxes[:, 2:] > 0).all(axis=1),
                 ((far > extent[:2]) & (boxes[:, :2] < extent[2:])).all(axis=1),
             )
-        left_out, told = np.zeros(len(FAULTS), int), []
+        left_out, warnings = np.zeros(len(FAULTS), int), []
         for i, (good, fault) in enumerate(zip(sound, FAULTS, strict=True)):
             wrong = np.flatnonzero(keep & ~good)
             left_out[i], keep = len(wrong), keep & good
             first = f"row {wrong[0]}, {shown(boxes[wrong[0]].tolist())}, is" if len(wrong) else ""
-            told.append(f"{named}, {first} {fault}; left out, as all such are")
+            warnings.append(f"{named}, {first} {fault}; left out, as all such are")
         rows = np.flatnonzero(keep)
         areas = np.prod(boxes[rows, 2:], axis=1)
         rows = rows[np.lexsort((rows, -areas, -scores[rows]))]
         classes = np.zeros(len(scores), int) if classes is None else classes
-        places = boxes[rows] / deviation if deviation else centred(boxes[rows])
-        kept, extent = (scores[rows], classes[rows], rows), extent / (deviation or 1.0)
+        boxes = centred(boxes[rows]) if kind.has_boxes else boxes[rows] / kind.unit
+        about, extent = (scores[rows], classes[rows], rows), extent / kind.unit
         vectors = None if vectors is None else vectors[rows]
-        return cls(places, *kept, extent, left_out, tuple(told), vectors=vectors)
+        return cls(boxes, *about, extent, left_out, tuple(warnings), vectors=vectors)
 
-    def at(self, chosen: np.ndarray | slice) -> "Found":
+    def at(self, chosen: np.ndarray | slice) -> "FrameDetections":
         """Some of them."""
         names = ["boxes", "scores", "classes", "rows", *["vectors"] * (self.vectors is not None)]
         return self._replace(**{name: getattr(self, name)[chosen] for name in names})
 
     def warn_of_first(self, before: Int[np.ndarray, "3"]) -> None:
         """Warn of each fault that comes for the first time: so many came before."""
-        for said, had, has in zip(self.told, before, self.left_out, strict=True):
+        for warning, had, has in zip(self.warnings, before, self.left_out, strict=True):
             if has and not had:
-                warn(said)
+                warn(warning)
 
     @property
     def places(self) -> Float[np.ndarray, "d k"]:

@@ -67,11 +67,16 @@ class Lives(NamedTuple):
 
     @classmethod
     def begun(
-        cls, identities: Int[np.ndarray, " k"], classes: Int[np.ndarray, " k"], at_once: bool
+        cls,
+        identities: Int[np.ndarray, " k"],
+        classes: Int[np.ndarray, " k"],
+        at_once: bool,
+        odds: float = 0.0,
     ) -> "Lives":
         """Those of new objects; boxes are confirmed at once in the first frame."""
         one, sure = np.ones_like(identities), np.full(len(identities), at_once)
-        return cls(identities, classes, 0.0 * one, one, 0.0 * one, 0.0 * one, sure, sure, 0.0 * one)
+        none = 0.0 * one
+        return cls(identities, classes, none, one, none, none, sure, sure, none + odds)
 
     def at(self, rows: np.ndarray) -> "Lives":
         """Those of some objects."""

@@ -19,11 +19,13 @@ from mpfjax.vision.tracking.adapters import (
     first_step,
     observed,
 )
-from mpfjax.vision.tracking.detections import Detections, Found
+from mpfjax.vision.tracking.detections import Detections, FrameDetections
 from mpfjax.vision.tracking.gaussian import CameraMotion
+from mpfjax.vision.tracking.kinds import BOXES, Kind
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
 from mpfjax.vision.tracking.state import Tracks
-from mpfjax.vision.tracking.tracker import ObjectTracker, advanced, coloured
+from mpfjax.vision.tracking.step import advanced
+from mpfjax.vision.tracking.tracker import ObjectTracker, coloured
 
 _STRONGEST = "; the strongest are kept (here and wherever else it is so)"
 
@@ -93,7 +95,7 @@ def track(
     on, with the number of the frame. Use it for recorded videos and for cameras.
     """
     del key
-    coordinates = 4 if tracker is None else tracker.coordinates
+    coordinates = (BOXES if tracker is None else tracker.kind).coordinates
     detector = as_detector(detections, coordinates)
     if frames is None and (callable(detector) or camera_motion == "pixels"):
         raise ValueError("frames: None; a detector, and camera_motion 'pixels', need them")
@@ -102,29 +104,32 @@ def track(
         tracker = ObjectTracker(detector.most_objects() if of_rows else LEAST_ROOM)
     first = (first_step(detector, first, tracker.rate) if frames is None else first) or 1
     if isinstance(frames, str | Path):
-        told: list[float] = []
-        frames, times = read_frames(frames, first, times=told), told if times is None else times
+        own_times: list[float] = []
+        frames = read_frames(frames, first, times=own_times)
+        times = own_times if times is None else times
     room = 2 * tracker.max_objects if max_detections is None else max_detections
     stills = None if frames is None else of_one_kind(frames, first)
     if camera_motion is None and stills is not None and use_colours and has_opencv():
         camera_motion = "pixels"
     flow = OpticalFlow() if camera_motion == "pixels" else None
-    found = observed(stills, detector, first, coordinates)
-    times, deviation = iter(() if times is None else times), tracker.point_deviation
-    seen = _seen(found, times, frame_size, min_score, room, use_colours, flow, deviation)
-    return _tracked(seen, tracker, ahead)
+    observations = observed(stills, detector, first, coordinates)
+    times = iter(() if times is None else times)
+    inputs = _inputs(
+        observations, times, frame_size, min_score, room, use_colours, flow, tracker.kind
+    )
+    return _tracked(inputs, tracker, ahead)
 
 
-class _Seen(NamedTuple):
+class _Inputs(NamedTuple):
     """All that a step takes of a frame."""
 
     number: int
-    found: Found | None
+    detections: FrameDetections | None
     motion: CameraMotion | None
     time: float | None
 
 
-def _seen(
+def _inputs(
     frames: Iterator[tuple[int, np.ndarray | None, Detections | None]],
     times: Iterator[float],
     frame_size: tuple[int, int] | None,
@@ -132,43 +137,43 @@ def _seen(
     room: int,
     use_colours: bool,
     flow: OpticalFlow | None,
-    deviation: float | None,
-) -> Iterator[_Seen]:
+    kind: Kind,
+) -> Iterator[_Inputs]:
     """What does not depend on earlier tracks, frame by frame."""
-    is_said = False
-    for number, still, detected in frames:
-        found, motion = None, None
+    is_warned = False
+    for number, still, detections in frames:
+        trackable, motion = None, None
         size = frame_size if still is None else still.shape[:2]
-        if detected is not None:
-            if min_score is not None and len(detected.boxes) and detected.scores is None:
+        if detections is not None:
+            if min_score is not None and len(detections.boxes) and detections.scores is None:
                 raise ValueError(f"min_score: {min_score}, and detections have no scores")
-            found = Found.of(detected, f"detections: frame {number}", size, deviation)
+            trackable = FrameDetections.of(detections, f"detections: frame {number}", size, kind)
             if min_score is not None:
-                found = found.at(found.scores >= min_score)
-            if len(found.rows) > room and not is_said:
-                said = f"frame {number} has {len(found.rows)}, more than the {room}"
-                warn(f"detections: {said} of max_detections{_STRONGEST}")
-                is_said = True
-            found = found.at(slice(room))
-            if use_colours and still is not None and deviation is None:
-                found = coloured(found, still)
+                trackable = trackable.at(trackable.scores >= min_score)
+            if len(trackable.rows) > room and not is_warned:
+                excess = f"frame {number} has {len(trackable.rows)}, more than the {room}"
+                warn(f"detections: {excess} of max_detections{_STRONGEST}")
+                is_warned = True
+            trackable = trackable.at(slice(room))
+            if use_colours and still is not None and kind.has_boxes:
+                trackable = coloured(trackable, still)
         if flow is not None and still is not None:
-            boxes = None if found is None or deviation else top_left(found.boxes)
-            motion = flow(still, boxes)
-        yield _Seen(number, found, motion, next(times, None))
+            is_hidden = trackable is None or not kind.has_boxes
+            motion = flow(still, None if is_hidden else top_left(trackable.boxes))
+        yield _Inputs(number, trackable, motion, next(times, None))
 
 
 def _tracked(
-    seen: Iterator[_Seen], tracker: ObjectTracker, ahead: bool
+    inputs: Iterator[_Inputs], tracker: ObjectTracker, ahead: bool
 ) -> Generator[Tracks, None, None]:
-    state, is_said = tracker.init(), False
-    with read_ahead(seen) if ahead else contextlib.nullcontext(seen) as coming:
-        for number, found, motion, time in coming:
-            state, tracks = advanced(tracker, state, found, motion, time)
-            if tracks.full and not is_said:
-                said = f"frame {number} has more objects than the {tracker.max_objects}"
-                warn(f"tracker: {said} of max_objects{_STRONGEST}")
-                is_said = True
+    state, is_warned = tracker.init(), False
+    with read_ahead(inputs) if ahead else contextlib.nullcontext(inputs) as coming:
+        for number, detections, motion, time in coming:
+            state, tracks = advanced(tracker, state, detections, motion, time)
+            if tracks.full and not is_warned:
+                excess = f"frame {number} has more objects than the {tracker.max_objects}"
+                warn(f"tracker: {excess} of max_objects{_STRONGEST}")
+                is_warned = True
             yield tracks
 
 

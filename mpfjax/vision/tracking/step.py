@@ -1,0 +1,402 @@
+"""The step of the tracker: prediction, comparison, association, update, survival, births."""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mpfjax.vision.tracking.associate import (
+    compatible,
+    learned_descriptors,
+    mahalanobis,
+    one_to_one,
+    probabilities,
+    unlikeness,
+)
+from mpfjax.vision.tracking.camera import jolted
+from mpfjax.vision.tracking.detections import FrameDetections
+from mpfjax.vision.tracking.gaussian import (
+    CameraMotion,
+    Gaussian,
+    along,
+    boxes_of,
+    overlap,
+    shared,
+    units,
+    within,
+)
+from mpfjax.vision.tracking.kinds import Kind
+from mpfjax.vision.tracking.lives import Lives, Spans
+from mpfjax.vision.tracking.scores import STRONG, WEAK
+from mpfjax.vision.tracking.state import TrackerState, Tracks
+from mpfjax.vision.tracking.vectors import cosine_distances
+
+if TYPE_CHECKING:
+    from mpfjax.vision.tracking.tracker import ObjectTracker
+
+# Of a weak detection, of an object that is not confirmed, and of one of another class.
+_WEAK_COST, _DOUBT_COST, _CLASS_COST = 8.0, 2.0, 8.0
+WEAK_ERROR = 1.35  # times the error of a strong detection
+_YIELDING = 0.01  # of the claim of an object that takes only what others leave
+_BIRTH_OVERLAP = 0.5  # with an object or a stronger detection: it is one more box of the same
+_SAME = 0.5  # least overlap of a prediction that was right with the detection
+_CONTACT = 0.12  # an overlap from which on objects would learn each other's colours
+_FIRST = 3  # strong detections of an object after which it teaches the noises
+
+
+class _Frame(NamedTuple):
+    """A frame's detections, and how they compare with the objects and with each other.
+
+    - `frames`: since the last frame on which the detector ran.
+    - `places`: (d, k), of the detections; `scores`: (d,), all equal if these are not to count.
+    - `costs`: (m, d), what pairs cost beside distance; `distances`: (m, d), cosine distances of
+      their vectors, (0, 0) without any.
+    - `overlaps`: (d, d), of detections that may be of one object.
+    - `strong`: (d,), which are, and `counts`: which may be of an object.
+    """
+
+    detections: FrameDetections
+    frames: float
+    spans: Spans
+    places: Float[np.ndarray, "d k"]
+    scores: Float[np.ndarray, " d"]
+    costs: Float[np.ndarray, "m d"]
+    distances: Float[np.ndarray, "a b"]
+    overlaps: Float[np.ndarray, "d d"]
+    strong: Bool[np.ndarray, " d"] = np.zeros(0, bool)
+    counts: Bool[np.ndarray, " d"] = np.zeros(0, bool)
+
+
+class _Matches(NamedTuple):
+    """The detection of each object.
+
+    - `columns`: (m,), which it is, -1 for none; `matched`: whether there is any; `strong`: a
+      strong one.
+    - `probabilities`: (m,), that it is the object's own; `gains`: (m,), of the object's log-odds.
+    """
+
+    columns: Int[np.ndarray, " m"]
+    matched: Bool[np.ndarray, " m"]
+    strong: Bool[np.ndarray, " m"]
+    probabilities: Float[np.ndarray, " m"]
+    gains: Float[np.ndarray, " m"]
+
+    def values(self, values: np.ndarray, none: Any) -> np.ndarray:
+        """The value of each object's detection, or another where there is none."""
+        filled = np.concatenate([values, np.full((1, *values.shape[1:]), none, values.dtype)])
+        return filled[self.columns]
+
+    def renewed(self, stays: Bool[np.ndarray, " m"], born: Int[np.ndarray, " b"]) -> "_Matches":
+        """Those of the objects that stay, and of those that begin at detections."""
+        sure = np.ones(len(born))
+        new = born, sure > 0, sure > 0, sure, 0.0 * sure
+        return _Matches(*(np.append(a[stays], b) for a, b in zip(self, new, strict=True)))
+
+
+def advanced(
+    tracker: "ObjectTracker",
+    state: TrackerState,
+    detections: FrameDetections | None,
+    motion: CameraMotion | None = None,
+    time: float | None = None,
+) -> tuple[TrackerState, Tracks]:
+    """A step with a frame's detections, or None where no detector ran."""
+    frames, time = _elapsed(tracker, state, time)
+    state, displacements, chains = _predicted(tracker.kind, state, motion, frames)
+    frames += state.waited
+    state = state._replace(number=state.number + 1, time=time, waited=frames)
+    if detections is None:
+        # Objects move on, and nothing is held against them.
+        state = state._replace(scores=state.scores._replace(boxes=chains), full=False)
+        none = np.full(len(state.lives.seen), -1)
+        return state, _tracks(tracker.kind, state, none, np.zeros(len(none)), 0)
+    detections.warn_of_first(state.left_out)
+    state, frame = _compared(tracker, state, detections, frames)
+    is_known = motion is not None and bool(motion.known)
+    state, shift = _with_camera(tracker.kind, state, frame, is_known, displacements)
+    state, frame = _judged(tracker, state, frame, chains + along(chains, shift))
+    return _associated(tracker, state, frame)
+
+
+def _associated(
+    tracker: "ObjectTracker", state: TrackerState, frame: _Frame
+) -> tuple[TrackerState, Tracks]:
+    """The part of a step that decides whose the detections are, with what follows from it."""
+    matches = _matched(tracker.kind, state, frame)
+    predicted, state = state.objects, _updated(state, frame, matches)
+    state, stays = _survived(state, frame, matches, predicted)
+    wanted = _unexplained(tracker, state, frame, matches, stays)
+    born = np.flatnonzero(wanted)[: tracker.max_objects - np.sum(stays)]
+    state = _renewed(tracker.kind, state, frame, matches, stays, born)
+    renewed = matches.renewed(stays, born)
+    state = _described(tracker, state, frame, matches, renewed, stays)
+    number, detections = len(frame.places) - np.sum(matches.matched), frame.detections
+    state = state._replace(
+        clutter=state.clutter.after(frame.places, number if state.begun else 0),
+        full=bool(np.sum(wanted) > len(born)), begun=True, waited=0.0,
+        left_out=state.left_out + detections.left_out,
+    )  # fmt: skip
+    rows, left_out = renewed.values(detections.rows, -1), int(detections.left_out.sum())
+    return state, _tracks(tracker.kind, state, rows, renewed.probabilities, left_out)
+
+
+def _elapsed(
+    tracker: "ObjectTracker", state: TrackerState, time: float | None
+) -> tuple[float, float | None]:
+    """Frames since the last one, and the time of this one in seconds, None where unknown."""
+    if state.time is None:
+        return 1.0, time
+    if time is None:
+        return 1.0, state.time + 1 / tracker.rate
+    if time <= state.time:
+        raise ValueError(f"time: {time} s is not after that of the frame before, {state.time} s")
+    return (time - state.time) * tracker.rate, time
+
+
+def _predicted(
+    kind: Kind, state: TrackerState, motion: CameraMotion | None, frames: float
+) -> tuple[TrackerState, Float[np.ndarray, "m 2"], Float[np.ndarray, "c k"]]:
+    """All so many frames later, and moved with the picture.
+
+    Also by how far the picture moves the objects, and the boxes of the chains.
+    """
+    objects, noise, chains = state.objects, state.noise, state.scores.boxes
+    if motion is not None:
+        motion = motion._replace(shift=motion.shift / kind.unit)
+        objects = motion.carried(objects)
+        noise = noise._replace(moments=motion.carried(noise.moments))
+        chains = np.concatenate([motion.moved(chains[:, :2]), chains[:, 2:]], axis=1)
+    displacements = (objects.place - state.objects.place)[:, :2]
+    _, place, velocity, _ = noise.noises
+    objects = objects.predicted(place, velocity, objects.unit, frames)
+    state = state._replace(objects=objects, noise=noise.predicted(frames))
+    return state, displacements, chains
+
+
+def _compared(
+    tracker: "ObjectTracker", state: TrackerState, detections: FrameDetections, frames: float
+) -> tuple[TrackerState, _Frame]:
+    """What pairs cost beside distance, and which detections may be of one object."""
+    if not tracker.class_matters:
+        detections = detections._replace(classes=np.zeros_like(detections.classes))
+    classes, colours, vectors = detections.classes, detections.colours, detections.vectors
+    other_class = _CLASS_COST if tracker.class_matters == "prefers" else np.inf
+    costs = np.where(compatible(state.lives.classes, classes), 0.0, other_class)
+    if colours is not None:
+        costs = costs + unlikeness(colours, state.colours)
+    distances = np.zeros((0, 0))
+    if vectors is not None:
+        state = _with_vectors(state, vectors.shape[1])
+        distances = cosine_distances(state.vectors, vectors)
+        costs = costs + state.likeness.cost(distances)
+    overlaps = overlap(detections.boxes, detections.boxes)
+    overlaps[~_may_be_one(tracker, classes, classes)] = 0.0
+    spans, scores = Spans.at(tracker.rate, tracker.lost_seconds), detections.scores
+    if tracker.scores == "ignore":
+        scores = np.ones_like(scores)
+    about = detections.places, scores, costs, distances, overlaps
+    return state, _Frame(detections, frames, spans, *about)
+
+
+def _with_vectors(state: TrackerState, size: int) -> TrackerState:
+    """With room for vectors of this size, where there were none so far."""
+    vectors = state.vectors
+    if vectors.shape[1] not in (0, size):
+        raise ValueError(f"detections: vectors of {size} numbers; there were {vectors.shape[1]}")
+    return state if vectors.shape[1] else state._replace(vectors=np.zeros((len(vectors), size)))
+
+
+def _with_camera(
+    kind: Kind,
+    state: TrackerState,
+    frame: _Frame,
+    is_known: bool,
+    displacements: Float[np.ndarray, "m 2"],
+) -> tuple[TrackerState, Float[np.ndarray, "2"]]:
+    """Objects moved with what they have in common beside the motion from pixels, and by how far."""
+    if not kind.has_boxes:
+        return state, np.zeros(2)
+    lives, errors = state.lives, state.noise.noises.errors
+    places, scores, costs = frame.places, frame.scores, frame.costs
+    seen = np.where(lives.confirmed & (lives.unseen == 0), lives.seen, 0)
+    counts, strong = (scores >= least for least in (state.scores.weak, state.scores.strong))
+    cost = mahalanobis(state.objects, errors, places, costs)
+    near = np.asarray(np.any(cost[:, counts] < 0, axis=1))
+    jolt = jolted(state.objects, errors, places[counts], costs[:, counts], seen, near)
+    objects, confirmed = state.objects.shifted(jolt), lives.confirmed
+    if jolt.any():
+        cost = mahalanobis(objects, errors, places, costs)
+    box = np.exp(objects.place[confirmed, 2:].sum(axis=0) / max(confirmed.sum(), 1))
+    strong_pairs = cost[np.ix_(confirmed, strong)], errors, places[strong]
+    camera, shift = state.camera.after(
+        objects.at(confirmed), displacements[confirmed] + jolt, is_known, *strong_pairs, box
+    )
+    shift = jolt + shift
+    noise = state.noise._replace(moments=state.noise.moments.shifted(shift))
+    objects = state.objects.shifted(shift)
+    return state._replace(objects=objects, noise=noise, camera=camera), shift
+
+
+def _judged(
+    tracker: "ObjectTracker", state: TrackerState, frame: _Frame, chains: Float[np.ndarray, "c k"]
+) -> tuple[TrackerState, _Frame]:
+    """With the thresholds of the scores, and which detections are strong."""
+    variance, scores = 2.0, frame.scores
+    if not tracker.kind.has_boxes:
+        variance += float(np.mean(state.noise.noises.speed**2))
+    learned = state.scores.after(
+        frame.detections.boxes, scores, frame.overlaps, chains, frame.frames,
+        frame.spans.lasting, variance,
+    )  # fmt: skip
+    if tracker.scores == "as_given":
+        learned = learned._replace(weak=WEAK, strong=STRONG)
+    frame = frame._replace(strong=scores >= learned.strong, counts=scores >= learned.weak)
+    return state._replace(scores=learned), frame
+
+
+def _matched(kind: Kind, state: TrackerState, frame: _Frame) -> _Matches:
+    """The detection of each object, and the probability that it is its own."""
+    others = 0.0 if kind.has_boxes else state.clutter.cost
+    errors = state.noise.noises.errors
+    distance = mahalanobis(state.objects, errors, frame.places, frame.costs, others)
+    cost = distance + np.where(frame.strong, 0.0, _WEAK_COST)
+    cost += np.where(state.lives.confirmed, 0.0, _DOUBT_COST)[:, None]
+    possible = frame.counts & (cost < 0)
+    cost = np.where(state.duplicates.doubtful[:, None], _YIELDING * cost, cost)
+    cost = np.where(possible, cost, np.inf)
+    columns = one_to_one(cost)
+    matched = columns >= 0
+    rows, probability = np.flatnonzero(matched), np.zeros(len(columns))
+    probability[rows] = probabilities(cost, kind.temperature)[rows, columns[rows]]
+    gains = np.where(matched, 0.0, kind.missed)
+    if not kind.has_boxes:
+        gains[rows] = -0.5 * distance[rows, columns[rows]]
+    strong = np.append(frame.strong, False)[columns]
+    return _Matches(columns, matched, strong, probability, gains)
+
+
+def _updated(state: TrackerState, frame: _Frame, matches: _Matches) -> TrackerState:
+    """The objects follow their detections by the probabilities of the pairs."""
+    rows = np.flatnonzero(matches.matched)
+    before, place = state.objects.at(rows), frame.places[matches.columns[rows]]
+    wider = np.where(matches.strong[rows], 1.0, WEAK_ERROR)[:, None]
+    updated, _, _ = before.updated(place, units(place) * state.noise.noises.errors * wider)
+    objects = Gaussian(*map(np.copy, state.objects))
+    objects.put(rows, updated.mixed_with(before, matches.probabilities[rows, None]))
+    return state._replace(objects=objects)
+
+
+def _survived(
+    state: TrackerState, frame: _Frame, matches: _Matches, predicted: Gaussian
+) -> tuple[TrackerState, Bool[np.ndarray, " m"]]:
+    """Counts of frames, which objects live on, and how right the predictions of the lost were."""
+    lives, spans, matched = state.lives, frame.spans, matches.matched
+    coast = state.coasting.longest(spans)
+    counts = matched, matches.strong, frame.frames, spans, coast, state.full
+    counted, stays = lives.counted(*counts, matches.gains)
+    extent = frame.detections.extent
+    stays &= within(boxes_of(state.objects.place), extent, centred=~matched)
+    right, rows = matched.copy(), np.flatnonzero(matched)
+    boxes = frame.detections.boxes[matches.columns[rows]]
+    right[rows] = shared(boxes_of(predicted.place[rows]), boxes) >= _SAME
+    ended = lives.confirmed & np.where(matched, ~right, ~stays)
+    unseen = lives.unseen + np.where(matched, 0.0, frame.frames)
+    coasting = state.coasting.after(unseen, lives.confirmed & right, ended, spans)
+    return state._replace(lives=counted, coasting=coasting), stays
+
+
+def _unexplained(
+    tracker: "ObjectTracker",
+    state: TrackerState,
+    frame: _Frame,
+    matches: _Matches,
+    stays: Bool[np.ndarray, " m"],
+) -> Bool[np.ndarray, " d"]:
+    """Which strong detections begin an object: no object has them, or is there already."""
+    boxes, classes, extent = (getattr(frame.detections, n) for n in ("boxes", "classes", "extent"))
+    covered = overlap(boxes_of(state.objects.place[stays]), boxes) > _BIRTH_OVERLAP
+    covered &= _may_be_one(tracker, state.lives.classes[stays], classes)
+    wanted = frame.strong & within(boxes, extent) & ~covered.any(axis=0)
+    wanted[matches.columns[matches.matched]] = False
+    return wanted & ~(np.triu(frame.overlaps > _BIRTH_OVERLAP, 1) & wanted[:, None]).any(axis=0)
+
+
+def _renewed(
+    kind: Kind,
+    state: TrackerState,
+    frame: _Frame,
+    matches: _Matches,
+    stays: Bool[np.ndarray, " m"],
+    born: Int[np.ndarray, " b"],
+) -> TrackerState:
+    """Without the objects that end, and with those that begin; the former teach the noises."""
+    objects, lives, noises = state.objects, state.lives, state.noise.noises
+    matched, places = matches.matched, frame.places[born]
+    teaches = matches.strong & stays
+    experienced = teaches & lives.confirmed & (lives.seen >= _FIRST)
+    grown = objects.at(teaches & (lives.seen == _FIRST))
+    its = frame.places[matches.columns[matched]]
+    noise = state.noise.after(matched, its, experienced[matched], grown)
+    moments = noise.moments.at(stays).joined(noise.begun(places, noises.speed))
+    unit = units(places)
+    start = Gaussian.begun(places, unit * noises.errors, unit * noises.speed)
+    names = state.last_identity + 1 + np.arange(len(born))
+    at_once = kind.has_boxes and not state.begun
+    begun = Lives.begun(names, frame.detections.classes[born], at_once, kind.odds)
+    colours, vectors = (
+        np.append(rows[stays], np.zeros((len(born), rows.shape[1])), axis=0)
+        for rows in (state.colours, state.vectors)
+    )
+    return state._replace(
+        objects=objects.at(stays).joined(start), lives=lives.at(stays).joined(begun),
+        noise=noise._replace(moments=moments), colours=colours, vectors=vectors,
+        last_identity=state.last_identity + len(born),
+    )  # fmt: skip
+
+
+def _described(
+    tracker: "ObjectTracker",
+    state: TrackerState,
+    frame: _Frame,
+    matches: _Matches,
+    renewed: _Matches,
+    stays: Bool[np.ndarray, " m"],
+) -> TrackerState:
+    """Scores, classes, colours and vectors of the objects, and which are second boxes."""
+    detections, matched = frame.detections, renewed.matched
+    values = renewed.values(detections.classes, 0), renewed.values(detections.scores, 0.0)
+    lives = state.lives.described(matched, *values)
+    boxes = boxes_of(state.objects.place)
+    overlaps = overlap(boxes, boxes)
+    overlaps[~_may_be_one(tracker, lives.classes, lives.classes)] = 0.0
+    duplicates = state.duplicates.after(lives.identities, stays, matched, overlaps)
+    lives = lives._replace(shown=lives.shown & ~duplicates.doubtful)
+    alone = np.sum(overlaps > _CONTACT, axis=1) <= 1  # each overlaps itself
+    colours, vectors, likeness = state.colours, state.vectors, state.likeness
+    if detections.colours is not None:
+        values = renewed.values(detections.colours, 0.0)
+        colours = learned_descriptors(colours, values, alone)
+    if detections.vectors is not None:
+        values = renewed.values(detections.vectors, 0.0)
+        vectors = learned_descriptors(vectors, values, alone)
+        same = matches.columns[:, None] == np.arange(len(frame.places))
+        likeness = likeness.after(frame.distances, same)
+    return state._replace(
+        lives=lives, duplicates=duplicates, colours=colours, vectors=vectors, likeness=likeness
+    )
+
+
+def _tracks(
+    kind: Kind, state: TrackerState, rows: np.ndarray, probability: np.ndarray, left_out: int
+) -> Tracks:
+    lives = state.lives
+    boxes = boxes_of(state.objects.place) * kind.unit
+    about = lives.identities, lives.confirmed, lives.unseen, state.full, lives.shown
+    return Tracks(boxes, *about, rows, probability, lives.classes, lives.scores, left_out)
+
+
+def _may_be_one(
+    tracker: "ObjectTracker", a: Int[np.ndarray, " m"], b: Int[np.ndarray, " d"]
+) -> Bool[np.ndarray, "m d"]:
+    """Whether boxes of these classes may be of one object."""
+    return compatible(a, b) | (tracker.class_matters == "prefers")
