@@ -198,11 +198,11 @@ def ours(sequence: Sequence, least: float | None, camera_motion: Motion | None) 
     )  # fmt: skip
     kept, compiling = [], 0.0
     steps = tqdm(
-        enumerate(clock.over("track", tracked), sequence.first),
+        clock.over("track", tracked),
         total=sequence.last - sequence.first + 1, desc=OURS, disable=None,
     )  # fmt: skip
-    for frame, tracks in steps:
-        kept.append(online_rows(frame, tracks))
+    for tracks in steps:
+        kept.append(online_rows(tracks))
         compiling = compiling or clock.seconds["track"]
     seconds = max(clock.seconds["track"] - compiling, 1e-9)
     return Run(np.concatenate(kept), (len(kept) - 1) / seconds)

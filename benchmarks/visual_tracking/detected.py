@@ -235,8 +235,11 @@ def rows_of_tracks(
     kept: list[list[Tracks]], first: int, num_runs: int, snapshots: list[Snapshot]
 ) -> list[np.ndarray]:
     """The rows of each run's tracks, as many frames as there are snapshots."""
-    tracked = kept[: len(snapshots)]
-    return [offline_rows([each[run] for each in tracked], first) for run in range(num_runs)]
+    tracked = [
+        [each._replace(number=number) for each in runs]
+        for number, runs in enumerate(kept[: len(snapshots)], first)
+    ]
+    return [offline_rows([runs[run] for runs in tracked]) for run in range(num_runs)]
 
 
 def _kind(leaf: np.ndarray) -> type:

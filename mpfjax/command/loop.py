@@ -54,8 +54,7 @@ class Results:
 
     def add(self, tracks: Tracks) -> np.ndarray:
         """Keep a frame's tracks, and return its rows."""
-        number = self.source.first + self.num_frames
-        rows = _with_sizes(online_rows(number, tracks, described=True))
+        rows = _with_sizes(online_rows(tracks, described=True))
         self.rows.append(rows)
         if self.options.offline:
             self.kept.append(tracks)
@@ -67,7 +66,7 @@ class Results:
     def all_rows(self) -> np.ndarray:
         """The rows of tracks.txt, with scores and classes."""
         if self.options.offline:
-            return _with_sizes(offline_rows(self.kept, self.source.first, described=True))
+            return _with_sizes(offline_rows(self.kept, described=True))
         return np.concatenate([np.zeros((0, 8)), *self.rows])
 
     def summary(self) -> dict[str, Any]:
@@ -142,7 +141,7 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
         if still is None:
             raise ValueError(f"--box: frame {source.first}, in which they are, cannot be decoded")
         boxes = read_boxes(options, still)
-        return lambda stills: follow_boxes(stills or (), boxes, key=key)
+        return lambda stills: follow_boxes(stills or (), boxes, key=key, first=source.first)
     rows, deviation = None, options.point_deviation
     if source.rows is not None:
         rows = Rows(source.rows, last=source.last, coordinates=4 if deviation is None else 2)

@@ -61,7 +61,7 @@ def test_points_among_false_ones_in_any_unit(scale):
     tracker = ObjectTracker(40, frames_per_second=1, point_deviation=5 * scale)
     followed, false = np.zeros((60, 5), int), 0
     for number, tracks in enumerate(track(None, np.array(rows), tracker)):
-        table = online_rows(number + 1, tracks, described=True)
+        table = online_rows(tracks, described=True)
         assert table.shape[1] == 6
         if not len(table):
             continue

@@ -73,7 +73,7 @@ def test_each_object_keeps_one_identity_and_its_place(with_pixels, without_pixel
     for run in (with_pixels, without_pixels):
         assert len(run) == NUM_FRAMES
         for number, tracks in enumerate(run[1:], 2):
-            rows = online_rows(number, tracks)
+            rows = online_rows(tracks)
             assert rows[:, 1].tolist() == [1, 2]
             # The stronger detection founds the first component.
             expected = truth[truth[:, 0] == number][::-1, 2:6]
@@ -286,28 +286,40 @@ def test_tracks_say_which_row_each_object_took_whatever_the_order_and_what_is_le
 # --- rows, trackers, drawn boxes -----------------------------------------------------------------
 
 
-def said(identities, confirmed, shown):
+def said(number, identities, confirmed, shown):
     boxes = np.tile([10.0, 20.0, 4.0, 8.0], (len(identities), 1))
     unseen = np.zeros(len(identities), int)
     return Tracks(
         boxes, np.array(identities), np.array(confirmed), unseen, np.array(False), np.array(shown),
         np.full(len(identities), -1), np.zeros(len(identities)), unseen, np.ones(len(identities)),
+        number=number,
     )  # fmt: skip
 
 
 def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_the_end():
     nobody = [False, False, False]
     kept = [
-        said([2, 1, 0], nobody, nobody),
-        said([2, 1, 3], [False, True, False], [False, True, False]),
-        said([0, 1, 3], [False, True, True], nobody),  # 3 is believed, but for a double
+        said(5, [2, 1, 0], nobody, nobody),
+        said(6, [2, 1, 3], [False, True, False], [False, True, False]),
+        said(7, [0, 1, 3], [False, True, True], nobody),  # 3 is believed, but for a double
     ]
-    online = np.concatenate([online_rows(i, tracks) for i, tracks in enumerate(kept, 5)])
+    online = np.concatenate([online_rows(tracks) for tracks in kept])
     assert online.tolist() == [[6, 1, 8, 16, 4, 8]]
-    offline = offline_rows(kept, 5)
+    offline = offline_rows(kept)
     assert offline[:, :2].tolist() == [[5, 1], [6, 1]]
     assert offline_rows([]).shape == (0, 6)
-    assert online_rows(6, kept[1], described=True).tolist() == [[6, 1, 8, 16, 4, 8, 1, 0]]
+    assert online_rows(kept[1], described=True).tolist() == [[6, 1, 8, 16, 4, 8, 1, 0]]
+
+
+def test_tracks_have_the_number_of_their_frame():
+    rows = walks()
+    late = rows[rows[:, 0] > 2]
+    assert [tracks.number for tracks in track(None, late)] == list(range(3, NUM_FRAMES + 1))
+    ours = np.concatenate([online_rows(tracks) for tracks in track(None, late)])
+    assert ours[0, 0] == 3
+    tracker = ObjectTracker()
+    _, tracks = tracker.step(None, tracker.init(), None, None)
+    assert tracks.number == 1
 
 
 @pytest.mark.exactness
@@ -320,7 +332,8 @@ def test_drawn_boxes_give_one_track_each_in_the_order_given():
     with pytest.raises(ValueError, match="frames: the first, in which the boxes are, is None"):
         next(follow_boxes([None], first))
     for number, tracks in enumerate(run, 1):
-        rows = online_rows(number, tracks)
+        assert tracks.number == number
+        rows = online_rows(tracks)
         assert rows[:, 1].tolist() == [1, 2]
         expected = walks()[walks()[:, 0] == number][::-1, 2:6]
         np.testing.assert_allclose(rows[:, 2:4], expected[:, :2], atol=9)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import checked, to_rows
+from mpfjax.checks import Count, checked, to_rows
 from mpfjax.filter import Filter, with_densities
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
 from mpfjax.operations.random import split_once
@@ -27,6 +27,7 @@ def follow_boxes(
     boxes: Float[np.ndarray, "k 4"],
     *,
     key: Key[Array, ""] | None = None,
+    first: Count = 1,
 ) -> Generator[Tracks, None, None]:
     """Follow boxes (x, y, w, h) of the first frame by their colours: yields `Tracks`, k rows each.
 
@@ -38,19 +39,20 @@ def follow_boxes(
     - `frames`: as for `track`; the boxes, top-left corner first, in pixels, lie in the first. One
       that is None is predicted.
     - `key`: of the random numbers; None takes `jax.random.key(0)`.
+    - `first`: the number of the first frame.
 
     Raises `ValueError` for no boxes, for boxes without area or outside the first frame, and for
     frames as `track` does. Use it if no detector finds the objects, and a user draws boxes around
     them.
     """
-    stills = of_one_kind(frames)
-    first: Any = next(stills, _END)
-    if first is _END:
+    stills = of_one_kind(frames, first)
+    initial: Any = next(stills, _END)
+    if initial is _END:
         return
-    if first is None:
+    if initial is None:
         raise ValueError("frames: the first, in which the boxes are, is None")
     boxes, key = to_rows(4, "boxes", boxes), jax.random.key(0) if key is None else key
-    filter = objects_filters(first, boxes)["mpf"]
+    filter = objects_filters(initial, boxes)["mpf"]
     model: Any = filter.model
     # It runs once, and takes longer to compile than to run.
     little = in_little_memory(soon=True)
@@ -58,11 +60,12 @@ def follow_boxes(
     # With XLA's newer emitters it takes longer to compile, and half the time to run.
     count = jit_with(cpu_options(soon=True), LearnedColourModel.prepare_observation)
     advance = jit_with(little, _advance_boxes)
-    for t, still in enumerate(itertools.chain([first], stills)):
+    for t, still in enumerate(itertools.chain([initial], stills)):
         # An array: each new Python number would compile anew.
         counted = None if still is None else count(model, still)
         mixture, tracks, growth = advance(filter, len(boxes), key, np.asarray(t), mixture, counted)
-        yield jax.device_get(with_densities(tracks, growth))
+        tracks = jax.device_get(with_densities(tracks, growth))
+        yield tracks._replace(number=first + t)
 
 
 def _advance_boxes(filter, num_objects, key, t, mixture, counted):

@@ -72,6 +72,7 @@ class Tracks(NamedTuple):
     - `classes`: (m,), the class of each, the first that its detections had; 0 for none.
     - `scores`: (m,), the score of the latest detection of each, 1 where detections have none.
     - `left_out`: how many detections of this frame could not be tracked.
+    - `number`: of the frame, as files and `track` count them; frames of `step` count from 1.
     """
 
     boxes: Float[Array | np.ndarray, "m k"]
@@ -85,6 +86,7 @@ class Tracks(NamedTuple):
     classes: Int[Array | np.ndarray, " m"]
     scores: Float[Array | np.ndarray, " m"]
     left_out: Int[np.ndarray, ""] | int = 0
+    number: int = 0
 
     @property
     def corner_boxes(self) -> Float[np.ndarray, "m k"]:

@@ -130,7 +130,7 @@ def _associated(
     state = _renewed(tracker.kind, state, frame, matches, stays, born)
     renewed = matches.renewed(stays, born)
     state = _described(tracker, state, frame, matches, renewed, stays)
-    number, detections = len(frame.places) - np.sum(matches.matched), frame.detections
+    number, detections = len(frame.places) - int(matches.matched.sum()), frame.detections
     state = state._replace(
         clutter=state.clutter.after(frame.places, number if state.begun else 0),
         full=bool(np.sum(wanted) > len(born)), begun=True, waited=0.0,
@@ -392,7 +392,9 @@ def _tracks(
     lives = state.lives
     boxes = boxes_of(state.objects.place) * kind.unit
     about = lives.identities, lives.confirmed, lives.unseen, state.full, lives.shown
-    return Tracks(boxes, *about, rows, probability, lives.classes, lives.scores, left_out)
+    return Tracks(
+        boxes, *about, rows, probability, lives.classes, lives.scores, left_out, state.number
+    )
 
 
 def _may_be_one(

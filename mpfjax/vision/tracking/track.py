@@ -158,8 +158,10 @@ def _inputs(
             if use_colours and still is not None and kind.has_boxes:
                 trackable = coloured(trackable, still)
         if flow is not None and still is not None:
-            is_hidden = trackable is None or not kind.has_boxes
-            motion = flow(still, None if is_hidden else top_left(trackable.boxes))
+            boxes = None
+            if trackable is not None and kind.has_boxes:
+                boxes = top_left(trackable.boxes)
+            motion = flow(still, boxes)
         yield _Inputs(number, trackable, motion, next(times, None))
 
 
@@ -174,25 +176,23 @@ def _tracked(
                 excess = f"frame {number} has more objects than the {tracker.max_objects}"
                 warn(f"tracker: {excess} of max_objects{_STRONGEST}")
                 is_warned = True
-            yield tracks
+            yield tracks._replace(number=number)
 
 
 # --- tracks as files have them -------------------------------------------------------------
 
 
-def online_rows(
-    number: int, tracks: Tracks, *, described: bool = False
-) -> Float[np.ndarray, "k columns"]:
-    """Rows (frame, id, x, y, w, h) of the objects that are shown in each frame (`Tracks.shown`).
+def online_rows(tracks: Tracks, *, described: bool = False) -> Float[np.ndarray, "k columns"]:
+    """Rows (frame, id, x, y, w, h) of the objects that are shown in a frame (`Tracks.shown`).
 
-    Those of points are (frame, id, x, y).
+    The frame is `Tracks.number`. Those of points are (frame, id, x, y).
     With `described` each has two more columns, the score of its latest detection and its class.
     """
-    return _rows(number, tracks, tracks.shown, described)
+    return _rows(tracks, tracks.shown, described)
 
 
 def offline_rows(
-    kept: Iterable[Tracks], first: int = 1, *, described: bool = False
+    kept: Iterable[Tracks], *, described: bool = False
 ) -> Float[np.ndarray, "r columns"]:
     """Rows of every object that was shown at some time, including its unconfirmed frames.
 
@@ -205,24 +205,28 @@ def offline_rows(
     chosen = np.array(sorted(believed - {0}))
     rows = [
         _rows(
-            number,
             tracks,
             np.isin(tracks.identities, chosen) & (tracks.shown | ~np.asarray(tracks.confirmed)),
             described,
         )
-        for number, tracks in enumerate(kept, first)
+        for tracks in kept
     ]
     coordinates = kept[0].boxes.shape[1] if kept else 4
     return np.concatenate([np.zeros((0, 2 + coordinates + 2 * described)), *rows])
 
 
-def _rows(number: int, tracks: Tracks, written: Any, described: bool) -> np.ndarray:
+def _rows(tracks: Tracks, written: Any, described: bool) -> np.ndarray:
     written = np.flatnonzero(np.asarray(written) & (np.asarray(tracks.identities) > 0))
     corners = tracks.corner_boxes[written]
     ids = np.asarray(tracks.identities)[written]
     more = (tracks.scores, tracks.classes) if described else ()
     rows = np.column_stack(
-        [np.full(len(ids), number), ids, corners, *(np.asarray(each)[written] for each in more)]
+        [
+            np.full(len(ids), tracks.number),
+            ids,
+            corners,
+            *(np.asarray(each)[written] for each in more),
+        ]
     )
     # Rounded as in files, so that scores are the same from a file.
     return np.round(rows[np.argsort(ids, kind="stable")], 3)
