@@ -18,6 +18,8 @@ TEMPERATURE = 2.0  # above 1 it allows for cues that are not independent
 
 def compatible(a: Int[np.ndarray, " m"], b: Int[np.ndarray, " d"]) -> Bool[np.ndarray, "m d"]:
     """Whether classes are the same, or one of them is 0 for none."""
+    if not a.any() or not b.any():
+        return np.ones((len(a), len(b)), bool)
     a, b = a[:, None], b[None]
     return (a == b) | (a == 0) | (b == 0)
 
@@ -94,13 +96,21 @@ def probabilities(
     cost: Float[np.ndarray, "m d"], temperature: float = TEMPERATURE
 ) -> Float[np.ndarray, "m d"]:
     """The marginals of pairs by their costs, -2 log p; a row without a pair costs nothing."""
-    log_odds, possible = -cost / (2 * temperature), np.isfinite(cost)
-    # Most pairs have no rival, and those who have are few.
-    rivals = possible & ((possible.sum(axis=1) > 1)[:, None] | (possible.sum(axis=0) > 1))
-    block = np.ix_(rivals.any(axis=1), rivals.any(axis=0))
-    probability = expit(log_odds)
-    probability[block] = marginals(log_odds[block])
+    rows, columns = np.nonzero(np.isfinite(cost))
+    probability = np.zeros(cost.shape)
+    probability[rows, columns] = expit(-cost[rows, columns] / (2 * temperature))
+    block = _rivals(cost.shape, rows, columns)
+    probability[block] = marginals(-cost[block] / (2 * temperature))
     return probability
+
+
+def _rivals(
+    shape: tuple[int, ...], rows: Int[np.ndarray, " p"], columns: Int[np.ndarray, " p"]
+) -> tuple[np.ndarray, ...]:
+    """The block of the few pairs that have a rival: another one in their row or column."""
+    others = np.bincount(rows, minlength=shape[0])[rows] > 1
+    others |= np.bincount(columns, minlength=shape[1])[columns] > 1
+    return np.ix_(np.unique(rows[others]), np.unique(columns[others]))
 
 
 def argmax_pairs(value: Float[np.ndarray, "m d"]) -> Int[np.ndarray, " m"]:
@@ -116,8 +126,12 @@ def argmax_pairs(value: Float[np.ndarray, "m d"]) -> Int[np.ndarray, " m"]:
 def one_to_one(cost: Float[np.ndarray, "m d"]) -> Int[np.ndarray, " m"]:
     """A column for each row at the least total cost; -1 for none, at cost 0."""
     source = np.full(len(cost), -1)
-    # A pair that costs more than none is as good as none.
-    rows, columns = linear_sum_assignment(np.minimum(cost, 0.0))
-    paired = cost[rows, columns] < 0
-    source[rows[paired]] = columns[paired]
+    # A pair that costs more than none is as good as none, and one without rivals is chosen.
+    rows, columns = np.nonzero(cost < 0)
+    source[rows] = columns
+    block = _rivals(cost.shape, rows, columns)
+    source[block[0][:, 0]] = -1
+    rows, columns = linear_sum_assignment(np.minimum(cost[block], 0.0))
+    paired = cost[block][rows, columns] < 0
+    source[block[0][rows[paired], 0]] = block[1][0, columns[paired]]
     return source

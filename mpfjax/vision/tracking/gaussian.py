@@ -189,7 +189,18 @@ def overlap(
     a: Float[np.ndarray, "m k"], b: Float[np.ndarray, "d k"], variance: float = 2.0
 ) -> Float[np.ndarray, "m d"]:
     """`shared` of every box or point with every other."""
-    return shared(a[:, None], b[None], variance)
+    if a.shape[-1] == 2:
+        return shared(a[:, None], b[None], variance)
+    # Most boxes are far apart along x: pairs from each left edge less the widest box on.
+    left, order = b[:, 0] - b[:, 2] / 2, np.argsort(b[:, 0] - b[:, 2] / 2)
+    low = a[:, 0] - a[:, 2] / 2 - np.max(b[:, 2], initial=0.0)
+    first, last = np.searchsorted(left[order], [low, a[:, 0] + a[:, 2] / 2])
+    counts = np.maximum(last - first, 0)
+    rows = np.repeat(np.arange(len(a)), counts)
+    columns = order[np.arange(len(rows)) + np.repeat(first - np.cumsum(counts) + counts, counts)]
+    overlaps = np.zeros((len(a), len(b)))
+    overlaps[rows, columns] = shared(a[rows], b[columns])
+    return overlaps
 
 
 def shared(
