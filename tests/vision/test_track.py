@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+import warnings
 
 import numpy as np
 import pytest
@@ -309,6 +310,30 @@ def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_
     assert offline[:, :2].tolist() == [[5, 1], [6, 1]]
     assert offline_rows([]).shape == (0, 6)
     assert online_rows(kept[1], described=True).tolist() == [[6, 1, 8, 16, 4, 8, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("form", "warning"),
+    [("corners", "boxes reach far beyond the frame"), ("shares", "lie within"), ("pixels", None)],
+)
+def test_boxes_that_are_not_corner_and_size_are_warned_of(form, warning):
+    rng = np.random.default_rng(0)
+    corners, sides = rng.uniform(0, 90, (4, 6, 2)), rng.uniform(5, 10, (4, 6, 2))
+    boxes = np.concatenate([corners, sides + (corners if form == "corners" else 0)], axis=2)
+    boxes = boxes / 100 if form == "shares" else boxes
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        list(track(None, list(boxes), frame_size=(100, 100)))
+    messages = [str(each.message) for each in caught]
+    assert len(messages) == (warning is not None)  # once
+    assert warning is None or f"{warning}" in messages[0]
+
+
+def test_a_first_row_is_shown_at_once_where_its_score_is_no_low_one():
+    for score, shown in ((0.1, 0), (0.9, 1)):
+        found = [(np.array([[10.0, 20.0, 5.0, 9.0]]), np.array([score]))] * 2
+        first, second = track(None, found)
+        assert (first.shown.sum(), second.shown.sum()) == (shown, 1)
 
 
 def test_tracks_have_the_number_of_their_frame():

@@ -13,6 +13,9 @@ from mpfjax.vision.tracking.kinds import BOXES, Kind
 # Why a detection cannot be tracked, in the order in which it is asked.
 FAULTS: tuple[str, ...] = ("not finite", "of no area", "outside the frame")
 
+# So many boxes tell whether they are x, y, w, h: by a tenth of the frame beyond it, or within 1.5.
+_ENOUGH, _BEYOND, _SHARES = 20, 1.1, 1.5
+_FORM = "they are taken for x, y, w, h in pixels, with (x, y) the top-left corner"
 _UNBOUNDED = (-np.inf, -np.inf, np.inf, np.inf)
 
 
@@ -132,6 +135,26 @@ class FrameDetections(NamedTuple):
         for warning, had, has in zip(self.warnings, before, self.left_out, strict=True):
             if has and not had:
                 warn(warning)
+
+    def form_counts(self, before: Int[np.ndarray, "3"]) -> Int[np.ndarray, "3"]:
+        """How many boxes there were, how many far beyond the frame, and how many within [0, 1.5].
+
+        `before` this frame, and now. Warns once of those that are no x, y, w, h: of second corners,
+        by which most reach beyond the frame, and of shares of the frame, all of which are small.
+        """
+        if before[0] >= _ENOUGH or self.boxes.shape[1] == 2:
+            return before
+        centres, halves = self.boxes[:, :2], self.boxes[:, 2:] / 2
+        beyond = (centres + halves > _BEYOND * self.extent[2:]).any(axis=1)
+        small = (centres >= halves).all(axis=1) & (centres + halves <= 2 * _SHARES).all(axis=1)
+        small &= (self.boxes <= _SHARES).all(axis=1)
+        counts = before + np.array([len(beyond), beyond.sum(), small.sum()])
+        number, num_beyond, num_small = counts
+        if number >= _ENOUGH and 2 * num_beyond > number:
+            warn(f"detections: {num_beyond} of {number} boxes reach far beyond the frame; {_FORM}")
+        if number >= _ENOUGH and num_small == number:
+            warn(f"detections: all of {number} boxes lie within [0, {_SHARES}]; {_FORM}")
+        return counts
 
     @property
     def places(self) -> Float[np.ndarray, "d k"]:

@@ -70,11 +70,11 @@ class Lives(NamedTuple):
         cls,
         identities: Int[np.ndarray, " k"],
         classes: Int[np.ndarray, " k"],
-        at_once: bool,
+        at_once: Bool[np.ndarray, " k"],
         odds: float = 0.0,
     ) -> "Lives":
-        """Those of new objects; boxes are confirmed at once in the first frame."""
-        one, sure = np.ones_like(identities), np.full(len(identities), at_once)
+        """Those of new objects; `at_once`: which are confirmed, and shown, from the first."""
+        one, sure = np.ones_like(identities), at_once
         none = 0.0 * one
         return cls(identities, classes, none, one, none, none, sure, sure, none + odds)
 

@@ -32,6 +32,7 @@ class TrackerState(NamedTuple):
     - `begun`: whether there was a frame on which the detector ran; `waited`: for how many frames it
       has not run since.
     - `time`: in seconds, of the last frame; None where nobody said it.
+    - `forms`: (3,), of the first boxes, as `FrameDetections.form_counts` has them.
     - `number`: how many frames there were; `left_out`: (3,), how many detections could not be
       tracked, by `FAULTS`.
     """
@@ -54,6 +55,7 @@ class TrackerState(NamedTuple):
     time: float | None = None
     number: int = 0
     left_out: Int[np.ndarray, "3"] = np.zeros(len(FAULTS), int)
+    forms: Int[np.ndarray, "3"] = np.zeros(3, int)
 
 
 class Tracks(NamedTuple):

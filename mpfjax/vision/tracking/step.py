@@ -111,6 +111,7 @@ def advanced(
         none = np.full(len(state.lives.seen), -1)
         return state, _tracks(tracker.kind, state, none, np.zeros(len(none)), 0)
     detections.warn_of_first(state.left_out)
+    state = state._replace(forms=detections.form_counts(state.forms))
     state, frame = _compared(tracker, state, detections, frames)
     is_known = motion is not None and bool(motion.known)
     state, shift = _with_camera(tracker.kind, state, frame, is_known, displacements)
@@ -341,7 +342,9 @@ def _renewed(
     unit = units(places)
     start = Gaussian.begun(places, unit * noises.errors, unit * noises.speed)
     names = state.last_identity + 1 + np.arange(len(born))
-    at_once = kind.has_boxes and not state.begun
+    # The scores of a first frame have hardly a rank: a single one is always the highest.
+    is_first = kind.has_boxes and not state.begun
+    at_once = is_first & (frame.scores[born] >= STRONG)
     begun = Lives.begun(names, frame.detections.classes[born], at_once, kind.odds)
     colours, vectors = (
         np.append(rows[stays], np.zeros((len(born), rows.shape[1])), axis=0)

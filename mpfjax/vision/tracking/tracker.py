@@ -85,7 +85,7 @@ class ObjectTracker(Checked):
         none, coordinates = np.zeros(0, int), self.kind.coordinates
         return TrackerState(
             objects=Gaussian.none(coordinates),
-            lives=Lives.begun(none, none, at_once=False),
+            lives=Lives.begun(none, none, at_once=none > 0),
             scores=ScoreState.initial(coordinates),
             noise=NoiseState.initial(self.rate, coordinates),
             colours=np.zeros((0, _BANDS * _COLOURS.num_bins)),
