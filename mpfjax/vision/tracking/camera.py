@@ -77,21 +77,22 @@ def jolted(
     unlike: Float[np.ndarray, "m d"],
     seen: Int[np.ndarray, " m"],
     near: Bool[np.ndarray, " m"],
+    counts: Bool[np.ndarray, " d"],
 ) -> Float[np.ndarray, "2"]:
     """The shift of a jolt that leaves most objects without a detection, zero if there was none.
 
     `unlike` is infinite where the two are no pair, `seen` is 0 for what was not seen lately, and
-    `near` says which have a detection near them. Where at most half of the objects have, the shifts
-    that bring one of the eight longest seen to one of the two detections next to it are tried: a
-    camera moves all by the same. The one that explains most counts, if that is three quarters of
-    them, and two more than without it.
+    `near` says which have a detection near them, and `counts` which detections are looked at. Where
+    at most half of the objects have, the shifts that bring one of the eight longest seen to one of
+    the two detections next to it are tried: a camera moves all by the same. The one that explains
+    most counts, if that is three quarters of them, and two more than without it.
     """
     rows = np.flatnonzero(seen)
     rows = rows[np.argsort(-seen[rows], kind="stable")]
     still = int(near[rows].sum())
     if 2 * still > len(rows) or len(rows) < still + 2:
         return np.zeros(2)
-    objects, unlike = predicted.at(rows), unlike[rows]
+    objects, unlike, places = predicted.at(rows), unlike[np.ix_(rows, counts)], places[counts]
 
     def explained(shift: np.ndarray) -> int:
         cost = mahalanobis(objects.shifted(shift), errors, places, unlike)

@@ -6,7 +6,7 @@ A box has the coordinates (x, y, log w, log h) in pixels, a point (x, y) in devi
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 # The share of a size's growth rate that is left after a frame.
 _GROWTH_KEPT = 0.9
@@ -191,6 +191,23 @@ def overlap(
     """`shared` of every box or point with every other."""
     if a.shape[-1] == 2:
         return shared(a[:, None], b[None], variance)
+    overlaps = np.zeros((len(a), len(b)))
+    rows, columns, values = overlapping(a, b)
+    overlaps[rows, columns] = values
+    return overlaps
+
+
+def overlapping(
+    a: Float[np.ndarray, "m k"],
+    b: Float[np.ndarray, "d k"],
+    least: float = 0.0,
+    variance: float = 2.0,
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """The pairs that share more than `least`: their rows, columns, and what they share."""
+    if a.shape[-1] == 2:
+        shares = overlap(a, b, variance)
+        rows, columns = np.nonzero(shares > least)
+        return rows, columns, shares[rows, columns]
     # Most boxes are far apart along x: pairs from each left edge less the widest box on.
     left, order = b[:, 0] - b[:, 2] / 2, np.argsort(b[:, 0] - b[:, 2] / 2)
     low = a[:, 0] - a[:, 2] / 2 - np.max(b[:, 2], initial=0.0)
@@ -198,9 +215,9 @@ def overlap(
     counts = np.maximum(last - first, 0)
     rows = np.repeat(np.arange(len(a)), counts)
     columns = order[np.arange(len(rows)) + np.repeat(first - np.cumsum(counts) + counts, counts)]
-    overlaps = np.zeros((len(a), len(b)))
-    overlaps[rows, columns] = shared(a[rows], b[columns])
-    return overlaps
+    values = shared(a[rows], b[columns])
+    above = values > least
+    return rows[above], columns[above], values[above]
 
 
 def shared(

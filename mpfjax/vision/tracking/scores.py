@@ -8,7 +8,7 @@ from scipy.optimize import isotonic_regression
 from scipy.special import expit, logit
 
 from mpfjax.vision.tracking.associate import argmax_pairs
-from mpfjax.vision.tracking.gaussian import overlap
+from mpfjax.vision.tracking.gaussian import overlapping
 
 # Minutes: in a street that is empty for a while, what is left must not set what is sure.
 _REMEMBERED = 8192
@@ -90,7 +90,7 @@ class ScoreState(NamedTuple):
         lowest = recent.min(initial=0.0)
         spread = sure - lowest
         shares = (scores - lowest) / spread if spread > 0 else np.ones_like(scores)
-        single = ~(np.triu(overlaps, 1) > _DUPLICATE).any(axis=0)
+        single = ~np.triu(overlaps > _DUPLICATE, 1).any(axis=0)
         state = self._continued(boxes[single], moved, shares[single], frames, lasting, variance)
         strong = lowest + state.strong_share() * spread
         # Where all scores are equal, rounding must not put them below the threshold.
@@ -109,13 +109,13 @@ class ScoreState(NamedTuple):
         """The chains after a frame whose detections have these shares of a sure score."""
         since = frames * (1 + self.unseen[:, None])
         ahead = moved + np.pad(since * self.steps, ((0, 0), (0, moved.shape[1] - 2)))
-        at_rest, in_motion, stepped = (
-            overlap(boxes, found, variance) for boxes in (self.boxes, moved, ahead)
-        )
-        near = np.maximum(at_rest, in_motion)
+        nearness = np.zeros((len(moved), len(found)))
         # At a low rate what is fast leaves its last box; elsewhere steps are mostly errors.
-        stepped = np.where(stepped > _SAME, stepped, 0.0)
-        rows = argmax_pairs(np.where(near > _SAME, 1 + near, stepped))
+        for boxes, certainty in ((ahead, 0), (self.boxes, 1), (moved, 1)):
+            *pairs, common = overlapping(boxes, found, _SAME, variance)
+            pairs = tuple(pairs)
+            nearness[pairs] = np.maximum(nearness[pairs], certainty + common)
+        rows = argmax_pairs(nearness)
         seen = rows >= 0
         held, new = np.flatnonzero(seen), np.setdiff1d(np.arange(len(found)), rows)
         steps = np.concatenate([self.steps, np.zeros((len(new), 2))])

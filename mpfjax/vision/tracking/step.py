@@ -222,8 +222,8 @@ def _with_camera(
     seen = np.where(lives.confirmed & (lives.unseen == 0), lives.seen, 0)
     counts, strong = (scores >= least for least in (state.scores.weak, state.scores.strong))
     cost = mahalanobis(state.objects, errors, places, costs)
-    near = np.asarray(np.any(cost[:, counts] < 0, axis=1))
-    jolt = jolted(state.objects, errors, places[counts], costs[:, counts], seen, near)
+    near = np.asarray(np.any((cost < 0) & counts, axis=1))
+    jolt = jolted(state.objects, errors, places, costs, seen, near, counts)
     objects, confirmed = state.objects.shifted(jolt), lives.confirmed
     if jolt.any():
         cost = mahalanobis(objects, errors, places, costs)
@@ -260,11 +260,12 @@ def _matched(kind: Kind, state: TrackerState, frame: _Frame) -> _Matches:
     others = 0.0 if kind.has_boxes else state.clutter.cost
     errors = state.noise.noises.errors
     distance = mahalanobis(state.objects, errors, frame.places, frame.costs, others)
-    cost = distance + np.where(frame.strong, 0.0, _WEAK_COST)
-    cost += np.where(state.lives.confirmed, 0.0, _DOUBT_COST)[:, None]
-    possible = frame.counts & (cost < 0)
-    cost = np.where(state.duplicates.doubtful[:, None], _YIELDING * cost, cost)
-    cost = np.where(possible, cost, np.inf)
+    pairs = np.nonzero(np.isfinite(distance) & frame.counts)
+    costs = distance[pairs] + np.where(frame.strong, 0.0, _WEAK_COST)[pairs[1]]
+    costs += np.where(state.lives.confirmed, 0.0, _DOUBT_COST)[pairs[0]]
+    claims = np.where(state.duplicates.doubtful, _YIELDING, 1.0)[pairs[0]]
+    cost = np.full(distance.shape, np.inf)
+    cost[pairs] = np.where(costs < 0, claims * costs, np.inf)
     columns = one_to_one(cost)
     matched = columns >= 0
     rows, probability = np.flatnonzero(matched), np.zeros(len(columns))
