@@ -148,7 +148,7 @@ class FrameDetections(NamedTuple):
         beyond = (centres + halves > _BEYOND * self.extent[2:]).any(axis=1)
         small = (centres >= halves).all(axis=1) & (centres + halves <= 2 * _SHARES).all(axis=1)
         small &= (self.boxes <= _SHARES).all(axis=1)
-        counts = before + np.array([len(beyond), beyond.sum(), small.sum()])
+        counts = before + np.array([len(self.boxes), np.sum(beyond), np.sum(small)])
         number, num_beyond, num_small = counts
         if number >= _ENOUGH and 2 * num_beyond > number:
             warn(f"detections: {num_beyond} of {number} boxes reach far beyond the frame; {_FORM}")
