@@ -30,7 +30,8 @@ nitpick_ignore_regex = [
     ("py:class", r"mpfjax\.moves\.resampling\.(line|ancestors)\.\w+"),
     ("py:class", r"mpfjax\.vision\.colour\.(bins|histograms)\.\w+"),
     ("py:class", r"mpfjax\.vision\.tracking\.(camera|clutter|gaussian|lives)\.\w+"),
-    ("py:class", r"mpfjax\.vision\.tracking\.(noise|scores|vectors)\.\w+"),
+    ("py:class", r"mpfjax\.vision\.tracking\.(kinds|noise|scores|vectors)\.\w+"),
+    ("py:class", r"mpfjax\.(mixture\.Within|models\.law\.Law)"),
 ]
 
 html_theme = "furo"
