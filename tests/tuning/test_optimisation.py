@@ -106,7 +106,10 @@ class TestPooling:
     def test_the_gradient_weighs_the_seeds_of_a_series_by_their_likelihood(self):
         problem = pose_evidence(small(8), SEVERAL, NOISE, {"r": Positive()})
         reals, keys = problem.start(), jax.random.split(jax.random.key(0), 3)
-        values = lambda u: jax.vmap(lambda key: problem.objective(key, problem.at({"r": u})))(keys)  # noqa: E731
+
+        def values(u):
+            return jax.vmap(lambda key: problem.objective(key, problem.at({"r": u})))(keys)
+
         each, slopes = np.asarray(values(reals["r"])), np.asarray(jax.jacfwd(values)(reals["r"]))
         weights = np.exp(each) / np.exp(each).sum(axis=0)
         for pooled, expected in ((True, (weights * slopes).sum()), (False, slopes.sum() / 3)):
