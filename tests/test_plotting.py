@@ -22,7 +22,7 @@ def test_components_stand_where_their_moments_are():
     by_regime = [mpfjax.GroupBy(lambda state: state.latent)]
     moves = [mpfjax.PropagateMarginalised(), mpfjax.Resample(), *by_regime]
     filter = mpfjax.Filter(SWITCHING, moves, 40, 3, initial_moves=by_regime)
-    mixtures = mpfjax.run_filter(jax.random.key(0), filter, SEEN).collected
+    mixtures = mpfjax.run_filter(jax.random.key(2), filter, SEEN).collected
     axis = draw_components(mixtures, 1, truth=np.zeros(len(SEEN))).axes[0]
     bars = [path[:, 1] for each in axis.collections for path in segments_of(each)]
     last = jax.tree.map(lambda leaf: leaf[-1], mixtures)
