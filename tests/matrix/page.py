@@ -10,17 +10,16 @@ from tests.matrix.table import AFTER_START, APPROXIMATE, RULES, UNSEEN, rules_of
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "compatibility.md"
 TEXT = """# What works with what
 
-One linear Gaussian law, whose exact answers a Kalman filter gives in float64, is written in
-every form in which a model can be written. The tests put every form, every kind of data, every
-filter and every question together (`tests/matrix/`). Each number is within four standard errors
-of the exact one, or the call is refused with a `ValueError`, or a warning says that the number
-cannot be trusted. This page is made from the table of the tests, by `python -m
-tests.matrix.page`.
+This page is for readers who combine a model, a kind of data, a filter and a question, and want to
+know which combinations are supported. The tests combine all of them for one linear Gaussian model,
+whose exact solution is known from a Kalman filter in float64, in every form in which a model can
+be written (`tests/matrix/`): each number is within four standard errors of the exact one, or the
+call is refused with a `ValueError`, or a warning says that the number cannot be trusted.
 
 - Models: {forms}.
 - Data: complete; missing by NaN, by `present=` with absurd placeholders, or left to the model
-  (`handles_missing`); each log-likelihood a million higher or lower; units a thousand times as
-  large or small; a step of zero likelihood; a very diffuse prior.
+  (`handles_missing`); log-likelihoods shifted by a million; units a thousand times larger or
+  smaller; a step of zero likelihood; a very diffuse prior.
 - Filters: {recipes}; all transforms and all pairs of transforms; {moves}.
 - Questions: {questions}.
 
@@ -28,21 +27,22 @@ tests.matrix.page`.
 
 {refused}
 
-Of a model that has nothing but the three methods, {bare} are refused. Of conditionally linear
+For models that define only the three methods, {bare} are refused; for conditionally linear
 models, {linear}.
 
 ## Pairs of transforms
 
-All pairs of {transforms} work in either order, except {pairs}.
+All pairs of {transforms} can be applied in either order, except {pairs}.
 
-## What a filter says of itself
+## Properties that a filter declares
 
-- `filter.approximate`: {approximate}. $\\log \\hat{{Z}}$ of all others is that of an unbiased
-  estimate.
-- A move's `biases_score`: {unseen}, besides any resampling without `with_score_gradient`.
-  Derivatives of $\\log \\hat{{Z}}$ are an unbiased estimate of the score with all others.
+- `filter.approximate` is true for {approximate}. For all others $\\hat{{Z}}$ is unbiased.
+- `biases_score` of a move is true for {unseen}, and for any resampling without
+  `with_score_gradient`. Derivatives are an estimate of the score for all others.
 
-Both are true of a move of your own unless its class says otherwise.
+Both are true for your own moves unless their classes declare otherwise.
+
+The page is generated from the table of the tests by `python -m tests.matrix.page`.
 """
 
 

@@ -90,21 +90,21 @@ RULES = (
          "`PropagateRegimes` needs a latent with finitely many values",
          forms=but(FORMS, "switching"), filters=these("PropagateRegimes")),
     Rule("conditionally linear",
-         "Gaussian filters, `PilotLookahead`, Metropolis moves, PaRIS and "
-         "conditional SMC need states that are drawn as a whole: no conditionally linear model",
+         "Gaussian filters, `PilotLookahead`, Metropolis moves, PaRIS and conditional SMC do not "
+         "support conditionally linear models, whose states are only partly sampled",
          forms=LINEAR, filters=GAUSSIAN | METROPOLIS | these("look-ahead")),
     Rule("conditionally linear|by 'exact'", "", forms=LINEAR, questions=OF_STATES),
-    Rule("floating point", "a Gaussian has no whole numbers: `where` leaves them out",
+    Rule("floating point", "Gaussian filters do not model whole numbers: exclude them by `where`",
          forms=these("tree", "whole numbers"), filters=GAUSSIAN),
     Rule("which draw is kept|derivatives do not see",
-         "`with_score_gradient` refuses moves whose draws a derivative does not see "
-         "(`biases_score`): several proposals a particle, filters of separate objects",
+         "`with_score_gradient` refuses moves whose random choices derivatives ignore "
+         "(`biases_score`): several proposals per particle, filters of separate objects",
          together=these("two draws", "score")),
     Rule("derivatives do not see", "",
          filters=these("with start > score", "with restarts > score")),
     Rule("log_initial|initial_from_noise|density|conditionally linear",
-         "a start and restarts need a density of x_0, and a state that is drawn as a whole, in "
-         "floating point",
+         "`with_start` and `with_restarts` need a density of x_0 and a state that is sampled "
+         "entirely, in floating point",
          forms=LINEAR | these("three methods", "one of several", "targets", "whole numbers"),
          filters=BEGUN),
     Rule("already", "", filters=these("with start > start")),
@@ -114,29 +114,29 @@ RULES = (
                        "with families > start", "with families > restarts")),
     Rule("which draw is kept|derivatives do not see", "", filters=UNSEEN, questions=these("score")),
     Rule("initial_noise|noise of|scheme of|draws in a way",
-         "the errors of one run (`with_eve_indices`) are for independent draws: no point sets, "
-         "other schemes than multinomial, several proposals, or choice of x_0",
+         "standard errors from one run (`with_eve_indices`) assume independent draws: no point "
+         "sets, schemes other than multinomial, several proposals, or selection of x_0",
          together=these("families", "point sets")),
     Rule("scheme of", "", filters=these("with families > stratified")),
     Rule("draws in a way", "", filters=these("with families > selected start")),
     Rule("single|one parent|ancestors",
-         "genealogies, and the methods \"mcmc\" of smoothers, need single ancestors: no Gaussian "
+         "genealogies and the method \"mcmc\" of smoothers need single ancestors: no Gaussian "
          "regeneration, islands or filters of separate objects",
          filters=GAUSSIAN | JOINT | these("IslandInteraction"), questions=OF_PARENTS),
     Rule("cannot keep a trajectory|independent|one Propagate|approximate",
-         "conditional SMC and particle Gibbs take `Resample`, `Propagate` and regrouping alone",
+         "conditional SMC and particle Gibbs support only `Resample`, `Propagate` and regrouping",
          filters=GAUSSIAN | OF_OBJECTS | METROPOLIS
          | these("point sets", "two draws", "PropagateNested", "Bernoulli",
                  "PropagateRegimes", "own function", "Prune", "Exclusion"),
          questions=OF_PATHS),
     Rule("unbiased likelihood",
-         "`metropolis_hastings` and `smc2` take no filter that is `approximate`",
+         "`metropolis_hastings` and `smc2` refuse filters that are `approximate`",
          filters=APPROXIMATE, questions=UNBIASED),
     Rule("slots", "filters of separate objects need every slot", filters=JOINT,
          questions=these("slots")),
     Rule("nearly all weight|hardly any draw|degenerate",
-         "a prior 100 000 standard deviations of the likelihood wide is warned of; a conditionally "
-         "linear model is exact",
+         "a prior that is 100 000 times broader than the likelihood causes a warning; a "
+         "conditionally linear model is exact",
          data=these("wide prior"), forms=but(FORMS, *LINEAR), warns=True),
 )  # fmt: skip
 # Left out until their cells have been run: empty the set to switch them on.
