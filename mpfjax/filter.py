@@ -41,21 +41,23 @@ BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 class Filter(eqx.Module):
     """A particle filter: a chain of moves on a particle mixture.
 
-    One step applies the moves in order and normalises. The growth of the total mass is the
-    increment of the marginal likelihood, whatever the moves are.
+    One step applies the moves in order and normalises. The growth of the total weight is the
+    increment of the marginal likelihood, for any moves.
 
-    - `model`: draws x_0, and is given to the moves, which hold none. So the filter is a pytree with
-      one copy of the model's parameters, and a gradient with respect to them is complete.
+    - `model`: draws x_0, and is passed to the moves, which store none. So the filter is a pytree
+      with one copy of the model's parameters, and a gradient with respect to them is complete.
     - `moves`: callables `(key, mixture, now) -> mixture`, usually `AbstractMove`s; `now` is a
       `Step`.
     - `num_particles`: N.
-    - `num_components`: M, the most components; recipes call it `max_components`.
-    - `initial_moves`: moves of x_0, which are given y_1 where it is known: regrouping, such as
-      `KMeans(reseed=True)`, and `SelectInitial`. What they weigh is part of the first increment.
-    - `initial_noise`: of x_0, where the model has `initial_from_noise`: that of `Propagate`.
+    - `num_components`: M, the maximum number of components; the filters of the literature call it
+      `max_components`.
+    - `initial_moves`: moves of x_0, which receive y_1 if it is known: regrouping, such as
+      `KMeans(reseed=True)`, and `SelectInitial`. Weights that they change enter the first
+      increment.
+    - `initial_noise`: the noise of x_0, if the model has `initial_from_noise`; see `Propagate`.
 
     Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never use an observation, a
-    model that a move cannot work with, or fewer slots than `particles_per_component` asks for.
+    model that a move does not support, or fewer slots than `particles_per_component` requires.
     """
 
     model: AbstractStateSpaceModel
@@ -102,16 +104,16 @@ class Filter(eqx.Module):
 
     @property
     def approximate(self) -> bool:
-        """Whether any move departs from the exact recursion, also of those of x_0."""
+        """Whether any move, including the initial ones, departs from the exact recursion."""
         return any(move.approximate for move in (*self.initial_moves, *self.moves))
 
     @property
     def weighs_initially(self) -> bool:
-        """Whether an initial move weighs x_0, by y_1 or otherwise."""
+        """Whether an initial move changes the weights of x_0, by y_1 or otherwise."""
         return any(move.weighs for move in self.initial_moves)
 
     def replace(self, **changes: Any) -> "Filter":
-        """The filter with other arguments, checked anew."""
+        """The filter with other arguments, which are checked again."""
         return dataclasses.replace(self, **changes)
 
     @checked
@@ -120,8 +122,8 @@ class Filter(eqx.Module):
     ) -> ParticleMixture:
         """The mixture of x_0: draws with equal weights, changed by the initial moves.
 
-        Give it y_1, and u_1 if there are inputs, where an initial move looks at them, such as
-        `SelectInitial`; without y_1 that move does nothing. y_1 is then given to `step` as well.
+        Pass y_1, and u_1 if there are inputs, if an initial move uses them, such as
+        `SelectInitial`; without y_1 that move does nothing. Pass y_1 to `step` as well.
         """
         if observation is not None:
             observation = one_observation(observation, self.model)
@@ -144,8 +146,7 @@ class Filter(eqx.Module):
 
         A NaN or infinite observation is an error, unless the model has `handles_missing`. For a
         step without an observation call `predict`. If every particle has zero likelihood, the
-        increment is -inf, the particles keep the weights that they had before, and `degenerate`
-        is true.
+        increment is -inf, the particles keep their previous weights, and `degenerate` is true.
         """
         return self._run(key, mixture, one_observation(observation, self.model), inputs)
 
@@ -153,7 +154,7 @@ class Filter(eqx.Module):
     def predict(
         self, key: Key[Array, ""], mixture: ParticleMixture, *, inputs: PyTree = None
     ) -> tuple[ParticleMixture, StepInfo]:
-        """One step without an observation: the particles propagate, the weights stay.
+        """One step without an observation: the particles are propagated, the weights do not change.
 
         Use it for a missing y_t, or to forecast. The increment is zero.
         """

@@ -1,4 +1,4 @@
-"""The filters of the literature, each a few lines that name its moves."""
+"""The filters of the literature, each defined in a few lines by its moves."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -55,9 +55,10 @@ def particle_filter(
 ) -> Filter:
     """The standard particle filter: resample, propagate.
 
-    Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given. Use
-    it for a filtering distribution with one mode. If there are several, it loses all but one.
-    `noise="rqmc"` is `with_point_sets`, and `gradient="stop"`, for tuning, `with_score_gradient`.
+    Vermaak et al. (2003), section 3, with one component; a bootstrap filter unless a proposal is
+    given. Use it for unimodal posteriors; when the posterior is multimodal, it eventually loses all
+    modes but one. `noise="rqmc"` is `with_point_sets`, and `gradient="stop"`, for tuning,
+    `with_score_gradient`.
     """
     moves = [Resample(scheme, ess_threshold=ess_threshold), Propagate(proposal)]
     return _with(noise, gradient, Filter(model, moves, num_particles))
@@ -77,9 +78,9 @@ def auxiliary_particle_filter(
     a proposal with `log_normaliser`, which then also draws x_t unless another `proposal` is given.
     Ẑ is unbiased for any look-ahead; see `AuxiliaryResample`. With `GaussNewtonProposal(1,
     inflation=1.0)` for a `LinearGaussianModel` the filter is fully adapted: ν is p(y_t | x_{t-1}),
-    x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are equal. Use it where the likelihood
-    is narrow and y_t shows early which particles will survive. It is `with_lookahead` of a
-    `particle_filter`, and so of any other filter.
+    x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are equal. Use it if the likelihood is
+    narrow and y_t determines early which particles will survive. The filter is `with_lookahead`
+    applied to a `particle_filter`, and can be applied to any other filter in the same way.
     """
     return with_lookahead(particle_filter(model, num_particles, proposal=proposal), lookahead)
 
@@ -102,28 +103,28 @@ def mixture_particle_filter(
 ) -> Filter:
     """The mixture particle filter: resample within components, propagate, regroup.
 
-    Vermaak et al. (2003), sections 3 and 4. Each component is resampled on its own and competes
+    Vermaak et al. (2003), sections 3 and 4. Each component is resampled separately and competes
     with the others only through its mixture weight, so that no component takes particles from
-    another. At every third step components that overlap merge, diffuse components split, and two
-    iterations of K-means refine the grouping. All of it is exact. If M is more than one, x_0 is
-    chosen by y_1 among four draws a particle (`SelectInitial`). Where the prior is very wide beside
-    the likelihood, take `with_start`.
+    another. At every third step, components that overlap are merged, diffuse components are split,
+    and two iterations of K-means refine the grouping, all of which is exact. If M is more than one,
+    x_0 is selected by y_1 from four draws per particle (`SelectInitial`). If the prior is diffuse
+    relative to the likelihood, use `with_start`.
 
-    - `features`, `scale`: the coordinates and units in which the grouping moves see the particles,
-      those of x_0 too (see `KMeans`; features of one particle, if the model is wrapped by
+    - `features`, `scale`: the coordinates of a particle that the grouping moves compare, and their
+      units, also for x_0 (see `KMeans`; features of one particle if the model is wrapped by
       `per_particle`).
-    - `regroup`: moves in the place of `Merge`, `Split` and `KMeans`, with features and thresholds
-      of their own.
-    - `regroup_every`: k where they run at every k-th step (see `Every`): take 1 where modes move
-      fast, or where a `Merge` counts frames with its `patience`. The default, 3, loses nothing
-      here. That of `gaussian_mixture_particle_filter` is 1, as a component that comes to hold two
-      modes loses them at its next step.
-    - `noise`: "rqmc" is `with_point_sets`: each component has a point set of its own, and the
-      masses of modes are far more accurate. `with_lookahead` comes with it, unless there is a
-      proposal or a conditionally linear model.
+    - `regroup`: moves that replace `Merge`, `Split` and `KMeans`, with their own features and
+      thresholds.
+    - `regroup_every`: k if they run at every k-th step (see `Every`). Use 1 if modes move fast, or
+      if a `Merge` counts frames by its `patience`. The default, 3, loses nothing here;
+      `gaussian_mixture_particle_filter` has 1, because a component that comes to contain two modes
+      loses them at its next step.
+    - `noise`: "rqmc" is `with_point_sets`: each component has a separate point set, and the mixture
+      weights are far more accurate. It includes `with_lookahead`, unless there is a proposal or a
+      conditionally linear model.
     - `gradient`: "stop" is `with_score_gradient`.
 
-    Use it where the filtering distribution has several modes and all of them must be kept.
+    Use it if the posterior has several modes that must all be retained.
     """
     plain = particle_filter(
         model, num_particles, proposal=proposal, scheme=scheme, ess_threshold=ess_threshold
@@ -148,9 +149,9 @@ def gaussian_particle_filter(
 ) -> Filter:
     """The Gaussian particle filter: redraw from the Gaussian of the moments, propagate.
 
-    Kotecha and Djuric (2003); Lin et al. (2012), section 3. It is an approximation for a filtering
-    distribution close to one Gaussian, and cannot keep two modes. `importance` is that of
-    `gaussian_mixture_particle_filter`.
+    Kotecha and Djuric (2003); Lin et al. (2012), section 3. It is an approximation for filtering
+    distributions that are close to a Gaussian, and cannot retain two modes.
+    `gaussian_mixture_particle_filter` describes `importance`.
     """
     refuse_marginalised(model, "gaussian_particle_filter")
     redraw = GaussianRegeneration() if regeneration is None else regeneration
@@ -177,19 +178,19 @@ def gaussian_mixture_particle_filter(
 ) -> Filter:
     """GM-MPF: redraw each component from the Gaussian of its moments, propagate, regroup.
 
-    Lin et al. (2012), section 4: the mixture particle filter with Gaussian regeneration in place
-    of resampling. The paper can be read in two ways about what is drawn from the importance
-    function q of eqs. 8 and 9, and `importance` chooses one. "propagated": particles are drawn
-    from the Gaussian of the filtering distribution, moved by the dynamics (or by `proposal`), and
-    weighted by L (or L D / q). "predictive_gaussian": these particles only give the moments of
-    the prediction (eqs. 12 and 13). New particles are drawn from its Gaussian, N(μ̄, Σ̄), and
-    weighted by L, since the Gaussian cancels in eq. 8. That is one more approximation and one
-    more draw. The other arguments are those of `mixture_particle_filter`. Components are regrouped
-    at every step: the Gaussian of one that holds two modes lies between them. With
-    `regroup_every=3` 12% of 400 runs lose a mode, with 1 one per cent (`python -m
+    Lin et al. (2012), section 4: the mixture particle filter with Gaussian regeneration instead of
+    resampling. The paper can be interpreted in two ways as to what is drawn from the importance
+    function q of eqs. 8 and 9, and `importance` selects one. "propagated": particles are drawn from
+    the Gaussian of the filtering distribution, propagated by the dynamics (or by `proposal`), and
+    weighted by L (or L D / q). "predictive_gaussian": these particles only determine the moments of
+    the prediction (eqs. 12 and 13); new particles are drawn from its Gaussian, N(μ̄, Σ̄), and
+    weighted by L, because the Gaussian cancels in eq. 8. The second is one more approximation and
+    requires one more draw. `mixture_particle_filter` describes the other arguments. Components are
+    regrouped at every step, because the Gaussian of a component with two modes is centred between
+    them. With `regroup_every=3` 12% of 400 runs lose a mode, with 1 one per cent (`python -m
     benchmarks.score_vs_particles --filters gm_mpf --seeds 400 --particles 100`).
 
-    The filter is an approximation, good where each mode is close to a Gaussian. Raises
+    The filter is an approximation that is accurate if each mode is close to a Gaussian. Raises
     `ValueError` for another `importance`, and for "predictive_gaussian" with a `proposal`.
     """
     plain = gaussian_particle_filter(
@@ -205,14 +206,14 @@ def partitioned_sampling(
     num_particles: Count,
     order: str | Sequence[int] | Array | None = None,
 ) -> Filter:
-    """Partitioned sampling: resample, then move one object after the other.
+    """Partitioned sampling: resample, then propagate one object after the other.
 
-    MacCormick and Blake (1999); Smith and Gatica-Perez (2004), section 3. `order` is a
-    permutation of the objects 0, ..., J-1; None is 0, ..., J-1, and "random" a new permutation at
-    every step. It needs far fewer particles than the joint particle filter, `particle_filter` on
-    the same model. But the first objects of the order keep only a few distinct hypotheses, and
-    hardly recover from an occlusion. It is unbiased in every order, also with an interaction.
-    `map_moves` changes its resampling, between steps and objects.
+    MacCormick and Blake (1999); Smith and Gatica-Perez (2004), section 3. `order` is a permutation
+    of the objects 0, ..., J-1; None is 0, ..., J-1, and "random" a new permutation at every step.
+    It needs far fewer particles than the joint particle filter, `particle_filter` on the same
+    model, but the first objects of the order retain only a few distinct hypotheses and hardly
+    recover from an occlusion. It is unbiased for every order, also with an interaction. `map_moves`
+    changes its resampling, between steps and objects.
     """
     return Filter(model, [Resample(), Partitioned(order)], num_particles)
 
@@ -224,16 +225,16 @@ def distributed_partitioned_sampling(
     orders: str | Sequence[Sequence[int]] | Array | None = None,
     reassembly: Reassembly = "prior",
 ) -> Filter:
-    """DPS: the particles are dealt into C sets, and the objects move in another order in each.
+    """DPS: the particles are divided into C sets, with another order of the objects in each.
 
-    Smith and Gatica-Perez (2004), section 4: pool and resample, deal the particles into C sets at
-    random, do partitioned sampling in each, reassemble. A fixed order leaves few distinct
+    Smith and Gatica-Perez (2004), section 4: pool and resample, divide the particles into C sets at
+    random, apply partitioned sampling in each, reassemble. A fixed order leaves few distinct
     hypotheses of its first objects; here all objects share this loss. `orders` are C permutations
     of the objects; None is the J circular shifts, and "random" J new permutations at every step.
-    `reassembly` is "prior", the paper's, where every set returns to its mass (an approximation: the
-    marginal likelihood is biased), or "evidence", which is exact. See `Partitioned` for both. Use
-    it where it is unknown which object will be hard to track, and N/C particles are enough to track
-    all.
+    `reassembly` is "prior", the paper's, in which the weight of every set returns to 1/C (an
+    approximation: the marginal likelihood is biased), or "evidence", which is exact. See
+    `Partitioned` for both. Use it if it is unknown which object will be difficult to track, and N/C
+    particles are sufficient to track all.
     """
     orders = "circular" if orders is None else orders
     partitioned = Partitioned(orders, reassembly=reassembly)
@@ -247,12 +248,12 @@ def distributed_partitioned_sampling(
 
 @checked
 def independent_particle_filters(model: MultiObjectModel, num_particles: Count) -> Filter:
-    """A small particle filter for each object, as if there were no other.
+    """A separate particle filter for each object, which ignores the other objects.
 
-    Each object has N particles, at the cost of a joint filter of N. It is exact where the objects
-    do not interact, and then the best choice. It ignores an interaction: filters of look-alikes
-    that cross may end on the same object. Estimates are after resampling; see
-    `PropagateIndependently`.
+    Each object has N particles, and a step evaluates as many likelihoods as a joint filter with N
+    particles. It is exact if the objects do not interact, and is then the best choice. It ignores
+    any interaction: filters of similar objects that cross may end on the same object. Estimates are
+    after resampling; see `PropagateIndependently`.
     """
     ignores = model.interaction is not None
     move = PropagateIndependently(ignores_interaction=ignores)
@@ -266,20 +267,20 @@ def clustered_particle_filter(
     *,
     start: Literal["apart", "together"] = "apart",
 ) -> Filter:
-    """A joint filter of clusters of objects; clusters merge where objects meet.
+    """A joint filter for each cluster of objects; clusters merge when objects meet.
 
-    Every object starts with a particle filter of its own. Two objects meet if the interaction ψ
-    between any of their predicted points is not 1. Their filters then become one joint filter,
-    weighted by ψ. In it, points of an object are still recombined among rows: each of an object's N
-    points serves every row, with the weight L f(point | row) / Σ f(point | any row). Without
-    interaction it is `independent_particle_filters`; with interaction it is unbiased. A step costs
-    N x J likelihood evaluations, as in partitioned sampling. `PropagateInClusters` has the
-    derivation, the options and what the object model must define.
+    Every object starts with a separate particle filter. Two objects meet if the interaction ψ
+    between any of their predicted points differs from 1. Their filters then become one joint
+    filter, weighted by ψ, in which the points of an object are recombined among rows: each of an
+    object's N points serves every row, with the weight L f(point | row) / Σ f(point | any row).
+    Without interaction it equals `independent_particle_filters`; with interaction it is unbiased. A
+    step evaluates N x J likelihoods, as in partitioned sampling. `PropagateInClusters` has the
+    derivation, the options and the methods that the object model must define.
 
-    Use it instead of a joint filter, PS or DPS wherever ψ has compact support, as in
-    `PairwiseRepulsion`. Otherwise all objects become one cluster at once. Estimates
-    are after resampling. A cluster's distribution may have several modes, such as two look-alikes
-    in either order. Their mean is then a place where no object is: take a median.
+    Use it instead of a joint filter, PS or DPS if ψ has compact support, as in `PairwiseRepulsion`;
+    otherwise all objects become one cluster immediately. Estimates are after resampling. The
+    distribution of a cluster may have several modes, such as two similar objects in either order.
+    Their mean is then a position without an object: use the median.
     """
     return Filter(model, [PropagateInClusters(start)], num_particles)
 
@@ -295,22 +296,21 @@ def bernoulli_filter(
     undetected_particles: Count = 400,
     resample: AbstractResampling | None = None,
 ) -> Filter:
-    """An unknown number of objects that come and go: predict, associate.
+    """An unknown number of objects that appear and disappear: predict, associate.
 
-    A Poisson multi-Bernoulli filter (Williams 2015) in particles. Each of `max_targets` components
-    is an object that exists with some probability. One more component holds the intensity of the
-    objects that no measurement has revealed. `targets` reads the objects out. `Associate` says how
-    the filter works, and what the last three arguments are.
+    A particle implementation of the Poisson multi-Bernoulli filter (Williams 2015): each of
+    `max_targets` components is a potential object with its own existence probability, and one more
+    component represents the intensity of undetected objects. `targets` summarises the objects.
+    `Associate` describes the algorithm and the last three arguments.
 
-    - `num_particles`: of all objects together: `undetected_particles`, and a hundred or more for
-      each object.
-    - `max_targets`: more than the measurements of a scan, where objects may appear anywhere.
+    - `num_particles`: in total: `undetected_particles`, and a hundred or more per object.
+    - `max_targets`: more than the number of measurements per scan if objects may appear anywhere.
 
-    By default each object is drawn anew from its Gaussian, for which a few particles are enough.
-    With `Resample()` it may have any shape. But then all its particles descend from the
-    `particles_per_birth` that it began with, so that there must be many of these. Use it with a
-    `TargetsModel`, if neither the number of objects nor which measurement is whose is known. For
-    one object take a filter with `ClutteredModel`, for boxes in a video `vision.ObjectTracker`.
+    By default each object is redrawn from its Gaussian, for which a few particles are sufficient.
+    With `Resample()` its distribution may have any shape, but then all its particles descend from
+    its first `particles_per_birth` particles, which must be numerous. Use the filter with a
+    `TargetsModel` if neither the number of objects nor the origin of the measurements is known. For
+    a single object use a filter with `ClutteredModel`, for boxes in a video `vision.ObjectTracker`.
     """
     resample = GaussianRegeneration() if resample is None else resample
     associate = Associate(

@@ -1,4 +1,4 @@
-"""The particle mixture: one set of joint weights, and all that is derived from it."""
+"""The particle mixture: one set of joint weights, and all quantities derived from it."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -48,9 +48,9 @@ class MarginalisedState(NamedTuple):
     - `latent`: z_t, a pytree whose leaves have a leading axis n.
     - `mean`, `covariance`: E and Cov of x_t given z_0, ..., z_t and y_1..y_t, (n, d) and (n, d, d).
 
-    Means over particles, as `ParticleMixture.mean` and `component_means`, are in this form too:
-    their covariance is that of x_t, E[Cov[x | z]] + Cov[E[x | z]]. Distances between particles,
-    and the flattened state, are those of `latent` and `mean`.
+    Means over particles, such as `ParticleMixture.mean` and `component_means`, have this form too;
+    their covariance is the covariance of x_t, E[Cov[x | z]] + Cov[E[x | z]]. Distances between
+    particles and flattened states are computed from `latent` and `mean`.
     """
 
     latent: PyTree
@@ -82,36 +82,38 @@ class Within(eqx.Module):
 class ParticleMixture(eqx.Module):
     """P_t = {N, M, Π, X, W, C}, the particles of a mixture (Vermaak et al. 2003, section 3).
 
-    It holds ONE set of joint log-weights ℓ_i = log(π_{c_i} w_i), normalised over all particles.
+    It stores ONE set of joint log-weights ℓ_i = log(π_{c_i} w_i), normalised over all particles.
     Mixture weights π_m = Σ_{c_i = m} exp ℓ_i and particle weights w_i = exp(ℓ_i) / π_{c_i} are
     derived and never stored. A reclustering (section 4) therefore only changes the indicators, and
     the exact re-weighting follows. Shapes are fixed: a slot of weight zero (ℓ = -inf) is empty, and
-    a component without a filled slot is dead.
+    a component without an occupied slot is empty too.
 
     - `particles`: a pytree whose leaves have a leading axis n, the states X.
     - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
     - `component_indicators`: C, shape (n,), in [0, num_components).
-    - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from;
-      -1 where it came from no single one (`AbstractMove.keeps_parents`), -2 where its state began
-      anew some steps before, in `with_start` and `with_restarts`.
-    - `num_components`: M, the most components that there can be, dead ones included; static. The
+    - `ancestor_indices`: shape (n,), the slot of each particle's parent in the previous step's
+      mixture; -1 if it has no single parent (`AbstractMove.keeps_parents`), -2 if its state was
+      restarted some steps before, by `with_start` or `with_restarts`.
+    - `num_components`: M, the maximum number of components, empty ones included; static. The
       filters of the literature call it `max_components`.
-    - `memory`: the memory that moves keep from step to step, by the move's name.
+    - `memory`: quantities that moves store from step to step, by the move's name.
     - `usable_slots`: how many slots a move may fill, the first ones; None is all of them. Only
       `monte_carlo(..., slots=...)` sets it.
-    - `t`: the number of steps; zero in a mixture of x_0. Within a step it is that step's number.
+    - `t`: the number of steps; zero in a mixture of x_0. Within a step it is the number of that
+      step.
     - `within`: what the moves of a step pass on to each other; None outside a step.
-    - `log_scale`: the logarithm of a common factor of all weights. It is kept apart from ℓ, which
-      would lose its digits if a log-likelihood of a million were added. After a step it is zero.
-      In a mixture of x_0 it is what the initial moves leave to the first increment.
-    - `waits`: whether resampling waits for the first observation. If this chose x_0, the weights
-      are the inverse of the choice until it has weighed x_1 too, and resampling before would undo
-      the choice. None if no initial move weighs.
-    - `periods`: of a model that has them, in the form of one state, so that means and covariances
-      are those on a circle. Within a step it is None.
+    - `log_scale`: the logarithm of a common factor of all weights. It is stored separately from ℓ,
+      which would lose its digits if a log-likelihood of a million were added. After a step it is
+      zero. In a mixture of x_0 it is the contribution of the initial moves to the first increment.
+    - `waits`: whether resampling is postponed until the first observation. If that observation
+      selected x_0, the weights are the inverse of the selection until it has weighted x_1 too, and
+      an earlier resampling would undo the selection. None if no initial move changes weights.
+    - `periods`: the periods of the model's state, in the form of one state, so that means and
+      covariances are circular. Within a step it is None.
 
-    The properties are those of one mixture. For a stack of mixtures, as `monte_carlo` and
-    `collect=None` return, they raise a `ValueError` that says to `jax.vmap` over the leading axes.
+    The properties are those of a single mixture. For a stack of mixtures, as returned by
+    `monte_carlo` and `collect=None`, they raise a `ValueError` that recommends `jax.vmap` over the
+    leading axes.
     """
 
     particles: PyTree
@@ -129,7 +131,7 @@ class ParticleMixture(eqx.Module):
 
     @property
     def num_particles(self) -> int:
-        """N, the number of slots, filled or not."""
+        """N, the number of slots, occupied or not."""
         self._require_one()
         return self.log_weights.shape[0]
 
@@ -140,12 +142,12 @@ class ParticleMixture(eqx.Module):
 
     @property
     def occupied(self) -> Bool[Array, " n"]:
-        """Which slots hold a particle of positive weight."""
+        """Which slots contain a particle of positive weight."""
         return self.log_weights > -jnp.inf
 
     @property
     def began_anew(self) -> Bool[Array, " n"]:
-        """Which slots hold a state that began anew some steps before (`with_restarts`)."""
+        """Which slots contain a state that was restarted some steps before (`with_restarts`)."""
         return self.ancestor_indices == BEGAN_ANEW
 
     @property
@@ -157,13 +159,13 @@ class ParticleMixture(eqx.Module):
 
     @property
     def log_mass(self) -> Float[Array, ""]:
-        """log Σ exp ℓ: zero once normalised, and the step's growth of mass before."""
+        """log Σ exp ℓ: zero once normalised, and the growth of the total weight before."""
         self._require_one()
         return log_sum_exp(self.log_weights) + self.log_scale
 
     @property
     def log_mixture_weights(self) -> Float[Array, " m"]:
-        """log π_m, -inf for a dead component."""
+        """log π_m, -inf for an empty component."""
         self._require_one()
         if self.num_components == 1:
             return log_sum_exp(self.log_weights)[None]
@@ -171,12 +173,12 @@ class ParticleMixture(eqx.Module):
 
     @property
     def mixture_weights(self) -> Float[Array, " m"]:
-        """π_m, zero for a dead component."""
+        """π_m, zero for an empty component."""
         return jnp.exp(self.log_mixture_weights)
 
     @property
     def component_counts(self) -> Int[Array, " m"]:
-        """How many filled slots each component has."""
+        """The number of occupied slots of each component."""
         self._require_one()
         labels = self.component_indicators
         if self.num_components == 1:
@@ -186,7 +188,7 @@ class ParticleMixture(eqx.Module):
 
     @property
     def active(self) -> Bool[Array, " m"]:
-        """Which components are alive."""
+        """Which components have particles."""
         self._require_one()
         if self.num_components == 1:
             return jnp.any(self.occupied)[None]
@@ -194,7 +196,7 @@ class ParticleMixture(eqx.Module):
 
     @property
     def component_weights(self) -> Float[Array, " n"]:
-        """w_i, the weights within each component; they sum to one in each living one."""
+        """w_i, the weights within each component; they sum to one in each active component."""
         self._require_one()
         if self.num_components == 1:
             return softmax(self.log_weights)
@@ -202,7 +204,7 @@ class ParticleMixture(eqx.Module):
 
     @property
     def component_effective_sample_sizes(self) -> Float[Array, " m"]:
-        """1 / Σ w_i² of each component, zero for a dead one."""
+        """1 / Σ w_i² of each component, zero for an empty one."""
         if self.num_components == 1:
             return self.effective_sample_size[None]
         squares, labels = self.component_weights**2, self.component_indicators
@@ -223,9 +225,9 @@ class ParticleMixture(eqx.Module):
         return segment_sum(_numbers(values), self.component_indicators, self.num_components)
 
     def component_averages(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, "m *rest"]:
-        """Σ_{c_i = m} w_i v_i, the weighted average of `values` in each component, zero if dead.
+        """Σ_{c_i = m} w_i v_i, the weighted mean of `values` in each component, zero if empty.
 
-        Whole numbers and booleans are averaged as floating point numbers.
+        Integers and booleans are averaged as floating-point numbers.
         """
         values = _numbers(values)
         weights = self.component_weights.astype(values.dtype)
@@ -237,11 +239,11 @@ class ParticleMixture(eqx.Module):
         return jnp.round(self.component_averages(groups)).astype(jnp.int32)
 
     def component_means(self) -> PyTree:
-        """The weighted mean of each component: every leaf (m, ...), NaN for a dead one.
+        """The weighted mean of each component: every leaf (m, ...), NaN for an empty one.
 
-        Leaves that are not floating point are averaged as `component_averages` does. Of what goes
-        round, by the model's `periods`, it is the direction of the mean vector on the circle
-        (Mardia and Jupp 2000), and at most half a period.
+        Leaves that are not floating point are averaged as in `component_averages`. For periodic
+        components of the state (the model's `periods`) it is the direction of the mean vector on
+        the circle (Mardia and Jupp 2000), and at most half a period.
         """
         means = _averages(self.component_averages, self.particles, self.periods)
         if isinstance(means, MarginalisedState):
@@ -252,9 +254,10 @@ class ParticleMixture(eqx.Module):
         return select_rows(self.active, means, nowhere)
 
     def component_covariances(self) -> Float[Array, "m d d"]:
-        """The weighted covariance of each component's flattened state, zero for a dead one.
+        """The weighted covariance of each component's flattened state, zero for an empty one.
 
-        What goes round, by the model's `periods`, differs from its mean by the shorter way.
+        Periodic components of the state (the model's `periods`) differ from their mean by the
+        shorter way around the circle.
         """
         if (periods := self.periods) is not None:
             shapes = jax.tree.map(lambda leaf: leaf[:1].shape, points(self.particles))
@@ -281,7 +284,7 @@ class ParticleMixture(eqx.Module):
     def mean(self) -> PyTree:
         """E[x_t | y_1..y_t], leaf by leaf, over the whole mixture; see `average`.
 
-        Of what goes round it is the mean on the circle, as for `component_means`.
+        For periodic components of the state it is the circular mean, as in `component_means`.
         """
         mass = jnp.exp(self.log_mass) if num_islands() > 1 else None
         means = _averages(self.average, self.particles, self.periods, mass)
@@ -294,8 +297,8 @@ class ParticleMixture(eqx.Module):
     def average(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, " *rest"]:
         """Σ_i exp(ℓ_i) v_i, the estimate of an expectation under the filtering distribution.
 
-        The average of an event is its probability: `m.average(m.particles["mode"] == 2)`. Whole
-        numbers and booleans are averaged as floating point numbers.
+        The average of the indicator of an event is its probability: `m.average(m.particles["mode"]
+        == 2)`. Integers and booleans are averaged as floating-point numbers.
         """
         values = _numbers(values)
         is_filled, zero = along_rows(self.occupied, values), jnp.zeros((), values.dtype)
@@ -306,9 +309,10 @@ class ParticleMixture(eqx.Module):
         return jnp.sum(jnp.where(is_filled, products, zero), axis=0)
 
     def variance(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, " *rest"]:
-        """Σ_i exp(ℓ_i) (v_i - E[v])², of each number apart; see `average`.
+        """Σ_i exp(ℓ_i) (v_i - E[v])², of each entry separately; see `average`.
 
-        It is about the mean: E[v²] - E[v]² would be rounding alone where v is far from zero.
+        It is computed about the mean, because E[v²] - E[v]² would be only rounding error if v is
+        far from zero.
         """
         values = _numbers(values)
         mean = sum_over_islands(self.average(values))
@@ -322,13 +326,13 @@ class ParticleMixture(eqx.Module):
     ) -> Inexact[Array, "..."]:
         """Weighted quantiles of a value of each particle: the smallest v with P(value <= v) >= q.
 
-        - `values`: (n, ...), of which each number counts apart, or a function of the particles that
-          returns them.
+        - `values`: (n, ...), of which each entry is treated separately, or a function of the
+          particles that returns them.
         - `q`: in [0, 1], a number or several, whose axes come first in the result.
 
-        `mixture.quantile(mixture.particles[:, 0], [0.05, 0.95])` is an interval of 90% of x_t's
-        first coordinate. Particles count by their weights, as they do not in `jnp.quantile`. The
-        means of a `MarginalisedState` spread less than x_t does.
+        `mixture.quantile(mixture.particles[:, 0], [0.05, 0.95])` is a 90% interval of the first
+        component of x_t. Particles are weighted, unlike in `jnp.quantile`. The means of a
+        `MarginalisedState` spread less than x_t does.
         """
         weights, shares = self.weights, jnp.asarray(q, self.log_weights.dtype)
         values = _numbers(values(self.particles) if callable(values) else values)
@@ -346,8 +350,8 @@ class ParticleMixture(eqx.Module):
     def weighed(self, *log_factors: Float[Array, "#n"]) -> "ParticleMixture":
         """The mixture with its weights multiplied by exp of the factors, one array or several.
 
-        The largest factor of the filled slots goes to `log_scale`, so that a constant of any size
-        only changes the mass. An empty slot stays empty whatever its factor is.
+        The largest factor of the occupied slots is moved to `log_scale`, so that a constant of any
+        size only changes the total weight. An empty slot stays empty for any factor.
         """
         log_weights, log_scale = self.log_weights, self.log_scale
         for factors in log_factors:
@@ -359,9 +363,9 @@ class ParticleMixture(eqx.Module):
         return self.replace(log_weights=log_weights, log_scale=log_scale)
 
     def normalised(self, previous: "ParticleMixture") -> tuple["ParticleMixture", Float[Array, ""]]:
-        """The mixture with a mass of one over all islands, and the logarithm of what it was.
+        """The mixture with total weight one over all islands, and the log of its previous total.
 
-        If no mass is left, the weights are those of `previous`.
+        If no weight is left, the weights are those of `previous`.
         """
         # The scale is removed first, which is exact. If it were added to the logarithm of the sum,
         # that would be lost to rounding.

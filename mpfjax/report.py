@@ -1,4 +1,4 @@
-"""The report of a step."""
+"""The report of a step of a filter."""
 
 import equinox as eqx
 import jax
@@ -9,26 +9,26 @@ from mpfjax.mixture import ParticleMixture
 
 
 class StepInfo(eqx.Module):
-    """The report of a step, which comes with its mixture.
+    """The report of a step, which is returned with its mixture.
 
-    - `log_likelihood_increment`: log p(y_t | y_1..y_{t-1}), estimated; -inf where every particle
-      has zero likelihood.
-    - `effective_sample_sizes`: of each component of the new mixture, zero for a dead one.
+    - `log_likelihood_increment`: log p(y_t | y_1..y_{t-1}), estimated; -inf if every particle has
+      zero likelihood.
+    - `effective_sample_sizes`: of each component of the new mixture, zero for an empty one.
     - `effective_sample_size`: 1 / Σ W², of the joint weights W of all particles.
-    - `mixture_weights`: the mass of each component of the new mixture.
-    - `resampled`: which components of the mixture that the step was given were resampled.
+    - `mixture_weights`: the weight of each component of the new mixture.
+    - `resampled`: which components of the previous mixture were resampled.
     - `degenerate`: whether every particle had zero likelihood: the weights are then those of the
       prediction.
-    - `labels_ran_out`: whether all M > 1 labels are in use, so that more modes share one; see
+    - `labels_ran_out`: whether all M > 1 labels are in use, so that further modes share one; see
       `Split.is_diffuse`.
     - `log_marginal_likelihood_error`: the standard error of log Ẑ of all steps so far, from this
-      one run; None unless the filter is one of `mpfjax.with_eve_indices`.
-    - `mixture_weight_errors`: the standard error of each mixture weight; None likewise.
-    - `log_evidence_against_start`: log of p(y_t | x_{t-1} ~ p_0) over p(y_t | y_1..y_{t-1}): how
-      much y_t speaks for a state that begins anew, against all that the filter knows; None unless a
-      move tells it, as in `with_alarm` and `with_restarts`.
+      single run; None unless the filter is from `mpfjax.with_eve_indices`.
+    - `mixture_weight_errors`: the standard error of each mixture weight; None as above.
+    - `log_evidence_against_start`: log of p(y_t | x_{t-1} ~ p_0) over p(y_t | y_1..y_{t-1}): the
+      evidence of y_t for a state that restarts from the prior, against the filter's hypotheses;
+      None unless a move computes it, as in `with_alarm` and `with_restarts`.
     - `surprised`: whether all hypotheses seem wrong: the cumulative sum of that evidence is above
-      5, see `FilterRun.surprised`; None likewise.
+      5, see `FilterRun.surprised`; None as above.
     """
 
     log_likelihood_increment: Float[Array, ""]

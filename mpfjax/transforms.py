@@ -1,4 +1,4 @@
-"""Filters made from filters, by changing their moves. They compose, also on chains of your own."""
+"""Transforms of filters, which change their moves; they compose, on any chain of moves."""
 
 import dataclasses
 from collections.abc import Callable
@@ -29,10 +29,10 @@ from mpfjax.moves.start.restart import Restart
 
 @checked
 def map_moves(filter: Filter, change: Callable[[Any], Any]) -> Filter:
-    """The filter with `change(move)` in the place of each move.
+    """The filter in which `change(move)` replaces each move.
 
-    It reaches the moves that others hold first, as those of an `Every`, and the resampling within a
-    `Partitioned`:
+    Moves inside other moves are changed first, such as those of an `Every`, and the resampling
+    within a `Partitioned`:
 
         map_moves(filter, lambda m: Resample("stratified") if isinstance(m, Resample) else m)
     """
@@ -54,7 +54,7 @@ def _mapped(filter: Filter, kind: Any, change: Callable[[Any], Any], within: boo
 
 
 def _map_kind(filter: Filter, kind: Any, change: Callable[[Any], Any]) -> Filter:
-    """The same of the chain's own moves of this kind alone."""
+    """The filter with changed moves of this kind, except moves inside propagations."""
     return _mapped(filter, kind, change, within=False)
 
 
@@ -66,22 +66,22 @@ def _require_resample(filter: Filter, what: str) -> None:
 
 @checked
 def with_resampling(filter: Filter, resample: Resample) -> Filter:
-    """The filter with this `Resample` in the place of its own; look-aheads stay.
+    """The filter with this `Resample` instead of the existing one; look-aheads are retained.
 
-    Raises `ValueError` for anything but a `Resample`. Use it for other slots of components:
-    `with_resampling(filter, Resample(allocation="equal"))`.
+    Raises `ValueError` for anything but a `Resample`. Use it to change the allocation of particles
+    to components: `with_resampling(filter, Resample(allocation="equal"))`.
     """
     return _map_kind(filter, Resample, lambda move: resample)
 
 
 @checked
 def with_point_sets(filter: Filter) -> Filter:
-    """The filter whose draws are randomised quasi-Monte Carlo: sequential quasi-Monte Carlo.
+    """The filter with randomised quasi-Monte Carlo draws: sequential quasi-Monte Carlo.
 
-    Gerber and Chopin (2015). All noise is "rqmc", that of x_0 included (see `Propagate`), and the
-    chain's own resamplings put particles in order along a Hilbert curve of their state, unless they
-    have a `sort_by`. Raises `ValueError` for a model or proposal that is not made of noise. Use it
-    where masses of modes and likelihoods must be accurate.
+    Gerber and Chopin (2015). All noise is "rqmc", including the noise of x_0 (see `Propagate`), and
+    the resamplings of the chain sort the particles along a Hilbert curve of their state, unless
+    they have a `sort_by`. Raises `ValueError` for a model or proposal that is not reparameterised.
+    Use it if mixture weights and likelihoods must be accurate.
     """
 
     def in_order(move: Resample) -> Resample:
@@ -93,11 +93,11 @@ def with_point_sets(filter: Filter) -> Filter:
 
 @checked
 def with_score_gradient(filter: Filter) -> Filter:
-    """The filter whose derivatives estimate the score, for tuning: gradient "stop" everywhere.
+    """The filter whose derivatives estimate the score, for tuning: gradient "stop" in all moves.
 
-    Ścibior and Wood (2021); values are the same to the bit. It reaches the resampling inside of
-    propagations too. Raises `ValueError` for a model without `log_transition`, and for moves of
-    which derivatives do not see all that is drawn (`biases_score`).
+    Ścibior and Wood (2021); values are identical to the bit. The resampling inside propagations is
+    included. Raises `ValueError` for a model without `log_transition`, and for moves whose random
+    choices derivatives ignore (`biases_score`).
     """
     changed = _everywhere(filter, "gradient", "stop")
     for move in all_of((*changed.initial_moves, *changed.moves)):
@@ -108,10 +108,10 @@ def with_score_gradient(filter: Filter) -> Filter:
 
 @checked
 def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
-    """The filter in which each particle draws K of x_t and keeps one: `PropagateNested`.
+    """The filter in which each particle draws K values of x_t and retains one: `PropagateNested`.
 
-    `num_draws` is K; with one, each particle draws once again. Raises `ValueError` for K < 1, and
-    for a filter without `Propagate`. Use it where the likelihood is narrow and cheap, with four to
+    `num_draws` is K; with 1, each particle draws once, as usual. Raises `ValueError` for K < 1, and
+    for a filter without `Propagate`. Use it if the likelihood is narrow and cheap, with four to
     sixteen draws.
     """
     require_propagation(filter._now(), "each particle draws")
@@ -127,10 +127,10 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
 def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter:
     """The filter that resamples by its weights times a look-ahead ν to y_t: `AuxiliaryResample`.
 
-    `lookahead` is that of the move; None is the filter's own proposal where that has a
-    `log_normaliser`, and else a `PilotLookahead`, which takes the model alone. One that is a
-    proposal also draws x_t, where the filter has no other. Raises `ValueError` for a filter
-    without `Resample`.
+    `lookahead` is the argument of that move; None is the filter's proposal if it has a
+    `log_normaliser`, and otherwise a `PilotLookahead`, which uses only the model. A look-ahead that
+    is a proposal also draws x_t if the filter has no other proposal. Raises `ValueError` for a
+    filter without `Resample`.
     """
     plain = _map_kind(filter, AuxiliaryResample, lambda move: move.resample)
     look = _own_lookahead(plain) if lookahead is None else lookahead
@@ -152,12 +152,12 @@ def _own_lookahead(filter: Filter) -> Lookahead:
 
 @checked
 def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
-    """The filter whose x_0 is chosen by y_1 among K N draws: a `SelectInitial` moves it first.
+    """The filter whose x_0 is selected by y_1 from K N draws, by an initial move `SelectInitial`.
 
-    `num_draws` is K; with one, x_0 is a plain draw again. The look at y_1 is that of the filter's
-    own propagation. Raises `ValueError` for K < 1, and for a filter without a `Propagate` or
-    `PropagateNested`. Use it where the prior is somewhat wide beside the likelihood; where it is
-    very wide, `with_start`.
+    `num_draws` is K; with 1, x_0 is a plain draw. The filter's propagation determines how y_1 is
+    predicted. Raises `ValueError` for K < 1, and for a filter without a `Propagate` or
+    `PropagateNested`. Use it if the prior is somewhat broader than the likelihood; if it is far
+    broader, use `with_start`.
     """
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
     if num_draws > 1 and any(move.at_start for move in _restarts(filter)):
@@ -170,17 +170,17 @@ def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
 
 @checked
 def with_start(filter: Filter, num_observations: Count = 8) -> Filter:
-    """The filter whose state is drawn anew at step L, by a tempered sampler on y_1..y_L.
+    """The filter whose state is redrawn at step L by a tempered sampler given y_1..y_L.
 
-    Before step L the filter runs as it is, and its increments are reported as zero; at step L the
-    particles are draws of p(x_L | y_1..y_L), and the increment is log p(y_1..y_L), so that Ẑ is
-    unbiased. See `Restart`. It costs as much as some 800 steps of a plain filter where the prior is
-    diffuse, little where it is not. Smoothing and derivatives of these steps are refused. Raises
-    `ValueError` for a model without `log_initial`, a density in all coordinates of the state, whose
+    Before step L the filter runs without change, and its increments are reported as zero; at step L
+    the particles are draws of p(x_L | y_1..y_L), and the increment is log p(y_1..y_L), so that Ẑ is
+    unbiased. See `Restart`. It takes as long as some 800 steps of a standard filter if the prior is
+    diffuse, and little if it is not. Smoothing and derivatives of these steps are refused. Raises
+    `ValueError` for a model without `log_initial`, a density of all components of the state, whose
     x_0 is not made of noise either, for a conditionally linear model, and in a run of fewer than L
-    steps. Use it where the prior is very diffuse, as of a pose in a building: few draws of x_0 are
-    near a mode then, and chance decides its weight.
-    `num_observations` is L: as many as tell the modes apart, also of restarts.
+    steps. Use it if the prior is very diffuse, such as for a pose in a building: few draws of x_0
+    are then near a mode, and chance decides its weight. `num_observations` is L: as many as
+    distinguish the modes. It is also the number for restarts.
     """
     if any(move.at_start for move in _restarts(filter)):
         raise ValueError("filter: it has a start by its first observations already")
@@ -196,17 +196,19 @@ def with_start(filter: Filter, num_observations: Count = 8) -> Filter:
 def with_restarts(
     filter: Filter, *, probability: InnerShare = 1e-3, num_observations: Count = 8
 ) -> Filter:
-    """The filter that finds a state again which begins anew, by a restart where the alarm rings.
+    """The filter that recovers a state that restarts from the prior, when an alarm is raised.
 
-    The alarm is that of `with_alarm`, of N draws if there is none yet. Where its sum has been above
-    zero for L steps or more, a sample of p(x_t | the last L observations) is joined to the
-    hypotheses by its evidence and p. That step costs as much as a start. A state that begins anew
-    is found L steps later at the earliest. See `Restart` for what Ẑ is unbiased for. It changes the
-    settings of a filter with restarts. Raises `ValueError` for a model that `with_start` refuses.
-    Use it where all hypotheses may be wrong: a robot that is carried away, a lost target.
+    The alarm is the one of `with_alarm`, with N draws if there is none yet. If its cumulative sum
+    has been positive for L steps or more, a sample of p(x_t | the last L observations) is added to
+    the hypotheses, weighted by its evidence and p. This step takes as long as the initialisation by
+    `with_start`. A state that restarts is recovered L steps later at the earliest. `Restart`
+    describes the model for which Ẑ is unbiased. For a filter with restarts, its settings are
+    changed. Raises `ValueError` for a model that `with_start` refuses. Use it if all hypotheses may
+    be wrong: a robot that is carried away, a lost target.
 
-    - `probability`: p, of having begun anew L steps ago, where the alarm rings.
-    - `num_observations`: L: as many as tell the modes apart, also of a start.
+    - `probability`: p, the probability of a restart L steps ago, when the alarm is raised.
+    - `num_observations`: L: as many as distinguish the modes. It is also the number for
+      `with_start`.
     """
     alarms = [move for move in filter.moves if isinstance(move, WatchStart)]
     alarms += [move for move in _restarts(filter) if move.probability is not None]
@@ -244,11 +246,11 @@ def _regroups(move: AbstractMove) -> bool:
 
 @checked
 def with_alarm(filter: Filter, num_particles: Count = 4096) -> Filter:
-    """The filter that says when all its hypotheses seem wrong: `FilterRun.surprised`.
+    """The filter that detects when all its hypotheses seem wrong: `FilterRun.surprised`.
 
-    At each step the increment is compared with the evidence for a state that begins anew:
-    `num_particles` draws of x_0, the same at each step, cost as much as so many particles. Use it
-    where a lost target must be noticed.
+    At each step the increment is compared with the evidence for a state that restarts from the
+    prior. It is estimated from `num_particles` draws of x_0, the same at each step, which take as
+    long as so many particles. Use it if a lost target must be noticed.
     """
     if any(move.probability is not None for move in _restarts(filter)):
         return _map_kind(
@@ -259,7 +261,7 @@ def with_alarm(filter: Filter, num_particles: Count = 4096) -> Filter:
 
 
 def _everywhere(filter: Filter, field: str, value: str) -> Filter:
-    """The filter with another value of a field in all moves that have it, also within others."""
+    """The filter with another value of a field in all moves that have it, also inner ones."""
 
     def replaced(node: Any) -> Any:
         if not isinstance(node, AbstractMove) or field not in node.__dataclass_fields__:
