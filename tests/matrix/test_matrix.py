@@ -9,7 +9,7 @@ import warnings
 
 import pytest
 
-from tests.marking import quick_of, weekly
+from tests.marking import quick_of
 from tests.matrix.data import FOR
 from tests.matrix.filters import FILTERS, MOVES, PAIRS, RECIPES, SINGLE, parts
 from tests.matrix.models import FORMS
@@ -73,7 +73,7 @@ def test_data(form):
 ROWS = known([(form, filter) for filter in SINGLES for form in FORMS])
 
 
-@pytest.mark.parametrize(("form", "filter"), weekly(ROWS))
+@pytest.mark.parametrize(("form", "filter"), quick_of(ROWS, [], one_in=20))
 def test_filters(form, filter):
     """Every recipe, transform and class of move, of every form."""
     check(form, filter, cells(GAPS, OF_RUNS))
@@ -82,7 +82,7 @@ def test_filters(form, filter):
 OF_PAIRS = known([(form, pair) for pair in PAIRS for form in ("inputs", "conditionally linear")])
 
 
-@pytest.mark.parametrize(("form", "pair"), weekly(OF_PAIRS))
+@pytest.mark.parametrize(("form", "pair"), quick_of(OF_PAIRS, [], one_in=20))
 def test_pairs_of_transforms(form, pair):
     """In either order."""
     check(form, pair, cells(GAPS, OF_RUNS))
@@ -91,7 +91,7 @@ def test_pairs_of_transforms(form, pair):
 ASKED = [(form, question) for form in FORMS for question in OTHERS]
 
 
-@pytest.mark.parametrize(("form", "question"), weekly(ASKED))
+@pytest.mark.parametrize(("form", "question"), quick_of(ASKED, [], one_in=12))
 def test_questions_of_forms(form, question):
     """Every question of every form, also where something is missing."""
     check(form, "particle", cells(GAPS, [question]))
@@ -101,7 +101,7 @@ TAKEN = ("inputs", "one of several", "targets", "switching")
 OF_FILTERS = [(f, q) for q in OTHERS for f in SINGLES if not AFTER_START & parts(f)]
 
 
-@pytest.mark.parametrize(("filter", "question"), weekly(OF_FILTERS))
+@pytest.mark.parametrize(("filter", "question"), quick_of(OF_FILTERS, [], one_in=40))
 def test_questions_of_filters(filter, question):
     """Every question of every filter, of the first form that it takes."""
     form = next(form for form in TAKEN if not rules_of(form, "complete", filter, "log Z"))
