@@ -1,6 +1,5 @@
 """Standard normal and uniform draws: independent, or spread evenly over particles."""
 
-import math
 from typing import Literal
 
 import equinox as eqx
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from mpfjax.operations.logarithms import default_float
+from mpfjax.operations.quantiles import normal_quantile
 from mpfjax.operations.random import (
     bits,
     normal,
@@ -93,7 +93,7 @@ def _num_digits(num_ranks: int) -> int:
 
 def normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
     """Quantiles of the standard normal at points in units of 2^-32."""
-    return math.sqrt(2) * jax.lax.erf_inv(2 * uniform_of(points, dtype) - 1)
+    return normal_quantile(2 * uniform_of(points, dtype) - 1)
 
 
 def uniform_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:

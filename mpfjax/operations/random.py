@@ -19,6 +19,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key, UInt32
 
 from mpfjax.operations.logarithms import default_float
+from mpfjax.operations.quantiles import normal_quantile
 from mpfjax.operations.stored import on_platform, stored
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -123,14 +124,25 @@ def below(key: Key[Array, ""], spans: Int[Array, "*shape"]) -> Int[Array, "*shap
 def normal(
     key: Key[Array, ""], shape: tuple[int, ...], dtype: DTypeLike | None = None
 ) -> Float[Array, "..."]:
-    """`jax.random.normal`, the same numbers in less time on a CPU.
+    """Standard normal draws: those of `jax.random.normal`, up to rounding, in less time on a CPU.
 
-    Use it in a model whose likelihood is so cheap that its noise takes half of a step.
+    It is √2 erf⁻¹(u) of the same uniform u on (-1, 1). That is for float32 on a CPU; elsewhere it
+    is `jax.random.normal` itself. Use it in a model whose likelihood is so cheap that its noise
+    takes half of a step.
     """
     dtype = default_float() if dtype is None else jnp.dtype(dtype)
-    if fast_key(key) is key or math.prod(shape) == 0:
-        return jax.random.normal(key, shape, dtype)
-    draws = jax.random.normal(fast_key(key), (math.prod(shape),), dtype)
+    stock = partial(jax.random.normal, shape=shape, dtype=dtype)
+    if dtype != jnp.float32 or math.prod(shape) == 0:
+        return stock(key)
+    return on_platform(key, cpu=partial(_normal, shape=shape), default=stock)
+
+
+def _normal(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "..."]:
+    lowest = np.nextafter(np.float32(-1), np.float32(0))
+    uniforms = jax.random.uniform(
+        fast_key(key), (math.prod(shape),), jnp.float32, minval=lowest, maxval=1.0
+    )
+    draws = normal_quantile(uniforms)
     # Operations fused with short rows are not vectorised.
     is_short = len(shape) > 1 and shape[-1] < _SHORT_ROW
     return (stored(draws) if is_short else draws).reshape(shape)

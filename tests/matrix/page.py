@@ -5,7 +5,7 @@ from pathlib import Path
 from tests.matrix.filters import MOVES, PAIRS, RECIPES, TRANSFORMS, parts
 from tests.matrix.models import FORMS
 from tests.matrix.questions import QUESTIONS
-from tests.matrix.table import AFTER_START, APPROXIMATE, RULES, UNSEEN, rules_of
+from tests.matrix.table import APPROXIMATE, RULES, UNSEEN, rules_of
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "compatibility.md"
 TEXT = """# What works with what
@@ -58,7 +58,7 @@ def refused_of(form: str) -> list[str]:
 def page() -> str:
     """The text of the page."""
     pairs = [name for name in PAIRS if rules_of("inputs", "complete", name, "log Z")]
-    pairs = [name.removeprefix("with ") for name in pairs if not AFTER_START & parts(name)]
+    pairs = [name.removeprefix("with ") for name in pairs]
     return TEXT.format(
         forms=", ".join(FORMS),
         recipes=", ".join(RECIPES),

@@ -139,8 +139,6 @@ RULES = (
          "conditionally linear model is exact",
          data=these("wide prior"), forms=but(FORMS, *LINEAR), warns=True),
 )  # fmt: skip
-# Left out until their cells have been run: empty the set to switch them on.
-AFTER_START = these("start", "restarts")
 
 
 def rules_of(form, data, filter, question):

@@ -11,11 +11,11 @@ import pytest
 
 from tests.marking import quick_of
 from tests.matrix.data import FOR
-from tests.matrix.filters import FILTERS, MOVES, PAIRS, RECIPES, SINGLE, parts
+from tests.matrix.filters import FILTERS, MOVES, PAIRS, RECIPES, SINGLE
 from tests.matrix.models import FORMS
 from tests.matrix.page import PAGE, page
 from tests.matrix.questions import OF_RUNS, OTHERS, QUESTIONS, Row
-from tests.matrix.table import AFTER_START, LINEAR, rules_of
+from tests.matrix.table import LINEAR, rules_of
 
 SINGLES = [*RECIPES, *SINGLE, *MOVES]
 OF_PARAMETERS = ("Gibbs, draw", "Gibbs", "Metropolis", "SMC²")
@@ -56,10 +56,6 @@ def check(form, filter, cells):
     assert not amiss, "\n".join(f"{cell}: {said}" for cell, said in amiss.items())
 
 
-def known(rows):
-    return [row for row in rows if not AFTER_START & parts(row[1])]
-
-
 def cells(datas, questions):
     return [(data, question) for data in datas for question in questions]
 
@@ -70,7 +66,7 @@ def test_data(form):
     check(form, "particle", cells(FOR[FORMS[form].data], OF_RUNS))
 
 
-ROWS = known([(form, filter) for filter in SINGLES for form in FORMS])
+ROWS = [(form, filter) for filter in SINGLES for form in FORMS]
 
 
 @pytest.mark.parametrize(("form", "filter"), quick_of(ROWS, [], one_in=20))
@@ -79,7 +75,7 @@ def test_filters(form, filter):
     check(form, filter, cells(GAPS, OF_RUNS))
 
 
-OF_PAIRS = known([(form, pair) for pair in PAIRS for form in ("inputs", "conditionally linear")])
+OF_PAIRS = [(form, pair) for pair in PAIRS for form in ("inputs", "conditionally linear")]
 
 
 @pytest.mark.parametrize(("form", "pair"), quick_of(OF_PAIRS, [], one_in=20))
@@ -98,7 +94,7 @@ def test_questions_of_forms(form, question):
 
 
 TAKEN = ("inputs", "one of several", "targets", "switching")
-OF_FILTERS = [(f, q) for q in OTHERS for f in SINGLES if not AFTER_START & parts(f)]
+OF_FILTERS = [(filter, question) for question in OTHERS for filter in SINGLES]
 
 
 @pytest.mark.parametrize(("filter", "question"), quick_of(OF_FILTERS, [], one_in=40))
