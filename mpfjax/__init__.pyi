@@ -82,13 +82,13 @@ from mpfjax.moves.regrouping.split import Split as Split
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample as AuxiliaryResample
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves.resampling.resample import Resample as Resample
-from mpfjax.operations.compiling import keep_programs as keep_programs
 from mpfjax.operations.random import normal as normal
 from mpfjax.report import StepInfo as StepInfo
 from mpfjax.running.islands import IslandInteraction as IslandInteraction
 from mpfjax.running.islands import run_islands as run_islands
 from mpfjax.running.late import Replay as Replay
 from mpfjax.running.long_runs import Checkpoint as Checkpoint
+from mpfjax.running.programs import keep_programs as keep_programs
 from mpfjax.running.run import monte_carlo as monte_carlo
 from mpfjax.running.run import run_filter as run_filter
 from mpfjax.running.scan import FilterRun as FilterRun

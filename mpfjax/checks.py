@@ -16,7 +16,6 @@ own classes; `| None` adds None. Any other annotation is for readers alone.
 import contextlib
 import difflib
 import functools
-import importlib
 import inspect
 import linecache
 import math
@@ -45,8 +44,6 @@ _JAX = ("jax", "jaxlib", "numpy")
 _LONGEST = 200
 _MOST = 2**31 - 1
 _EXACT, _FAR = 2**24, 2**17  # float32 holds whole numbers up to the first, and 1/64 at the second
-# Of the largest entry of a covariance, which rounding may change by this much.
-_ROUNDING = 1e-4
 
 
 def is_series(value: Any) -> TypeGuard[Iterable[Any]]:
@@ -71,7 +68,7 @@ def as_numbers(
     rounded, but of numbers `in_time`, the leading axis, float32 must not lose the differences. With
     `floating`, whole numbers and booleans become floating point numbers.
     """
-    array = _array_of_numbers(name, value, may_be_complex)
+    array = array_of_numbers(name, value, may_be_complex)
     if in_time:
         _check_differences(name, array)
     if floating and not jnp.issubdtype(array.dtype, jnp.inexact):
@@ -138,28 +135,7 @@ def _array(value: Any) -> Any:
         return jnp.asarray(value) if of_jax else np.asarray(value)
 
 
-def check_spacing(name: str, places: Any, scale: Any, of_what: str) -> None:
-    """Raise a `ValueError` for places that float32 cannot tell apart on their own scale.
-
-    `scale` is a length for all or each of them, such as the side of a cell, a radius or a standard
-    deviation, in words `of_what`: twenty numbers of float32 must lie within it.
-    """
-    parts = (places, scale)
-    default = jax.dtypes.canonicalize_dtype(np.float64)
-    if default == np.float64 or any(isinstance(part, Tracer) for part in parts):
-        return
-    far, near = np.broadcast_arrays(*(np.asarray(part, float) for part in parts))
-    with np.errstate(over="ignore", invalid="ignore"):
-        spacing = np.spacing(np.abs(far).astype(np.float32))
-    is_coarse = (near > 0) & (spacing > 0.05 * near)
-    if is_coarse.any():
-        at = int(np.argmax(is_coarse))
-        place, gap, side = (float(part.ravel()[at]) for part in (far, spacing, near))
-        what = f"near {place:.10g} numbers of float32 are {gap:.2g} apart, and {of_what} {side:.3g}"
-        raise ValueError(f"{name}: {what}; subtract an origin first, or set jax_enable_x64")
-
-
-def _array_of_numbers(name: str, value: Any, may_be_complex: bool = False) -> Any:
+def array_of_numbers(name: str, value: Any, may_be_complex: bool = False) -> Any:
     """The argument as an array of its own type, of JAX where any part of it is."""
     array = value if isinstance(value, jax.Array) else _array(value)
     # A mask or an imaginary part would later be dropped without a word.
@@ -167,31 +143,6 @@ def _array_of_numbers(name: str, value: Any, may_be_complex: bool = False) -> An
     if np.ma.is_masked(value) or not _has_numbers(array) or not is_real:
         kind = "numbers" if may_be_complex else "real numbers"
         raise ValueError(f"{name}: {shown(value)} is no array of {kind}, none of them masked")
-    return array
-
-
-def to_array(name: str, *, floating: bool = True) -> Callable[[Any], Any]:
-    """A converter of the argument of this name to an array, for `eqx.field(converter=...)`.
-
-    With `floating`, whole numbers and booleans become floating point numbers. None stays None,
-    which the annotation may refuse.
-    """
-
-    def convert(value: Any) -> Any:
-        return value if value is None else jnp.asarray(as_numbers(name, value, floating=floating))
-
-    return convert
-
-
-def to_numbers(name: str) -> Callable[[Any], tuple[float, ...]]:
-    """A converter of the argument of this name, one number or several, to a tuple of them."""
-    return lambda value: tuple(np.ravel(_array_of_numbers(name, value)).astype(float).tolist())
-
-
-def real_array(shape: str, name: str, value: Any) -> Any:
-    """The argument as an array of JAX in floating point, of this shape, see `check_shape`."""
-    array = jnp.asarray(as_numbers(name, value, floating=True))
-    check_shape(shape, **{name: array})
     return array
 
 
@@ -213,17 +164,6 @@ def check_shape(shape: str, /, **arguments: Any) -> None:
                 raise ValueError(f"{name}: {shown(value)} is no array of numbers, ({axes})")
             if not isinstance(value, array_of(shape)):
                 raise ValueError(f"{name}: shape {value.shape} is not ({axes})")
-
-
-def to_rows(width: int | None, name: str, value: Any) -> np.ndarray:
-    """The argument as rows of `width` numbers; a vector is one row, and an empty list is none."""
-    rows = np.atleast_2d(np.asarray(_array_of_numbers(name, value), float))
-    columns = int(rows.shape[-1]) if width is None else width
-    if rows.size == 0:
-        return np.zeros((0, columns))
-    if rows.ndim != 2 or rows.shape[1] != columns:
-        raise ValueError(f"{name}: shape {rows.shape} is not that of rows of {columns} numbers")
-    return rows
 
 
 def _has_numbers(array: Any) -> bool:
@@ -327,14 +267,6 @@ def entries(holds: Callable[[np.ndarray], Any], what: str) -> Rule:
     return Rule(all_hold, what)
 
 
-def _is_covariance(array: np.ndarray) -> bool:
-    if array.ndim < 2 or array.shape[-1] != array.shape[-2] or not np.isfinite(array).all():
-        return False
-    mirrored, slack = np.swapaxes(array, -1, -2), _ROUNDING * np.abs(array).max()
-    lowest = np.linalg.eigvalsh(0.5 * (array + mirrored).astype(float)).min()
-    return bool(np.abs(array - mirrored).max() <= slack and lowest >= -slack)
-
-
 Count = Annotated[int, whole(1)]
 CountOrZero = Annotated[int, whole(0)]
 Finite = Annotated[float, number(math.isfinite, "a finite number")]
@@ -343,12 +275,8 @@ NotNegative = Annotated[float, number(lambda x: 0 <= x < math.inf, "a finite num
 Share = Annotated[float, share()]
 InnerShare = Annotated[float, number(lambda x: 0 < x < 1, "a number in (0, 1)")]
 Exponent = Annotated[float, number(lambda x: 0 < x <= 1, "a number in (0, 1]")]
-# For arrays: `Annotated[Float[Array, " d"], POSITIVE]`.
-POSITIVE = entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite throughout")
-NOT_NEGATIVE = entries(lambda array: (array >= 0) & np.isfinite(array), "finite and not negative")
-FINITE = entries(np.isfinite, "finite throughout")
+# For arrays: `Annotated[Float[Array, " d"], SHARES]`.
 SHARES = entries(lambda array: (array >= 0) & (array <= 1), "in [0, 1] throughout")
-COVARIANCE = entries(_is_covariance, "a covariance, symmetric without a negative eigenvalue")
 
 
 def check(hint: Any, what: str = "", /, **arguments: Any) -> None:
@@ -370,27 +298,6 @@ class Checked(eqx.Module):
     def __check_init__(self) -> None:
         for name, rule in _rules(type(self)).items():
             rule.check(getattr(self, name), name)
-
-
-class Fitting(Checked):
-    """A base of classes whose arrays fit together: each word of their shapes is one length.
-
-    So `Float[Array, "d d"]` beside `Float[Array, " d"]`. The axes of a word with a star, none or
-    several, are the same in all fields.
-    """
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        fitting: dict[str, tuple[int, ...]] = {}
-        with jaxtyping.jaxtyped("context"):
-            for name, hint in _hints(type(self)).items():
-                value, kinds = getattr(self, name), _array_kinds(hint)
-                if not kinds or not hasattr(value, "shape"):
-                    continue
-                if not isinstance(value, kinds):
-                    axes = " or ".join(f"({', '.join(kind.dim_str.split())})" for kind in kinds)
-                    raise ValueError(f"{name}: shape {value.shape} is not {axes}, with {fitting}")
-                fitting[name] = value.shape
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -462,19 +369,12 @@ RULES: dict[type, Rule] = {}
 @functools.cache
 def _rules(owner: Any) -> dict[str, Rule]:
     """By name, the rules for the arguments of a function or the fields of a class."""
-    rules = {name: _rule(hint) for name, hint in _hints(owner).items() if name != "return"}
+    rules = {name: _rule(hint) for name, hint in hints_of(owner).items() if name != "return"}
     return {name: rule for name, rule in rules.items() if rule is not None}
 
 
-def _array_kinds(hint: Any) -> tuple[Any, ...]:
-    if isinstance(hint, type) and hasattr(hint, "dim_str"):
-        return (hint,)
-    parts = () if typing.get_origin(hint) is Callable else typing.get_args(hint)
-    return tuple(kind for part in parts for kind in _array_kinds(part))
-
-
 @functools.cache
-def _hints(owner: Any) -> dict[str, Any]:
+def hints_of(owner: Any) -> dict[str, Any]:
     is_class = isinstance(owner, type)
     # A user's subclass says by its annotations what it likes.
     told = [base for base in owner.__mro__[::-1] if _is_ours(base)] if is_class else [owner]
@@ -538,14 +438,6 @@ def is_key(value: Any) -> bool:
 def _instance(kind: type) -> Rule:
     article = "an" if kind.__name__[0] in "AEIO" else "a"
     return Rule(lambda value: isinstance(value, kind), f"{article} {kind.__name__}")
-
-
-def optional(module: str, package: str) -> types.ModuleType:
-    """The module of an extra, or an `ImportError` that says how to install it."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"{module} is missing: pip install {package}") from error
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ A number out of range is an error of argparse, with exit status 2.
 import argparse
 import contextlib
 import gc
+import importlib
 import json
 import math
 import os
@@ -18,8 +19,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from mpfjax.operations.compiling import keep_programs
-from mpfjax.running.storage import write_whole
+from mpfjax.files import write_whole
 
 
 def _read_by(
@@ -92,7 +92,8 @@ def exit_status(run: Callable[[], None], arguments: Sequence[str] | None = ()) -
     a segmentation fault.
     """
     with contextlib.suppress(OSError, RuntimeError):  # the latter where there is no home
-        keep_programs()
+        # Imported only now: reading the arguments does not wait for JAX.
+        importlib.import_module("mpfjax.running.programs").keep_programs()
     # Tracing leaves so many objects that Python's collector takes a third of the time before a
     # first result, by going through them again and again.
     gc.set_threshold(100_000, 20, 20)

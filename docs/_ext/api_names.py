@@ -39,7 +39,8 @@ def _public_in(module: Any) -> list[str]:
     is_package = hasattr(module, "__path__")
     return [
         name
-        for name, value in vars(module).items()
+        for name in dir(module)
+        for value in [getattr(module, name)]
         if not name.startswith("_")
         and callable(value)
         and getattr(value, "__module__", "").startswith("mpfjax.")

@@ -1,28 +1,11 @@
-"""The arguments of the command, and the source of the frames."""
+"""The arguments of the command."""
 
 import argparse
 import importlib
-import os
 import re
-import warnings
 from pathlib import Path
-from typing import NamedTuple
 
-import numpy as np
-
-from mpfjax.console import check_outputs, finite, positive, seed, whole
-from mpfjax.vision.files import boxes as box_files
-from mpfjax.vision.files import frames
-from mpfjax.vision.files.sequences import (
-    SequenceInfo,
-    Truth,
-    detection_files,
-    last_frame,
-    read_sequence_info,
-    read_truth,
-    sequence_of,
-)
-from mpfjax.vision.tracking.adapters import Rows, first_step
+from mpfjax.console import finite, positive, seed, whole
 
 DESCRIPTION = """\
 Track objects in a video or a folder of images. What to track comes from one of three: detections
@@ -38,53 +21,12 @@ examples:
 """
 
 SOURCE = "a video, a folder of images, or detections: a file of them, or a folder with det.txt"
-TRACKS, VIDEO, SUMMARY = OUTPUTS = ("tracks.txt", "tracking.mp4", "summary.json")
+TRACKS = "tracks.txt"
 FORMATS = {"mot": TRACKS, "coco": "tracks.json", "csv": "tracks.csv"}
-SCORES = ("HOTA", "MOTA", "IDF1")
-NO_SCORES = "no HOTA, MOTA and IDF1"
-_INNER = ("img", "img1")
-_TEXT = (".txt", ".csv")
-_NOT_WITH = {
-    "box": (
-        "max_objects",
-        "min_score",
-        "no_colour",
-        "camera_motion",
-        "offline",
-        "lost_seconds",
-        "classes",
-        "point_deviation",
-        "truth",
-    ),
-    "detect": ("min_score", "classes", "point_deviation"),
-    "point_deviation": ("truth",),
-}
 
 
-class Source(NamedTuple):
-    """The frames to track in, and their metadata."""
-
-    path: Path
-    has_pixels: bool
-    rows: np.ndarray | None  # detections; None where they are yet to be found
-    first: int  # the number of the first frame
-    last: int | None  # None where it is unknown until all frames are read
-    num_frames: int | None
-    frames_per_second: float | None
-    frame_size: tuple[int, int] | None  # None where it is unknown before the frames are read
-    truth: Truth | None
-
-
-def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The arguments, checked as far as possible without the frames."""
-    parser, track = _parsers()
-    options = parser.parse_args(arguments)
-    _check(track, options)
-    return options
-
-
-def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
-    """That of the whole command line, and that of `track`."""
+def parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
+    """The parser of the whole command line, and the one of `track`."""
     parser = argparse.ArgumentParser(prog="mpfjax", description="Particle filters that track.")
     package = importlib.import_module(__name__.partition(".")[0])
     parser.add_argument("--version", action="version", version=f"mpfjax {package.__version__}")
@@ -98,8 +40,15 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
     )
     # A box that reaches beyond the left border is no option, though it begins with a minus sign.
     track._negative_number_matcher = re.compile(r"-[\d.]")
+    _add_input(track)
+    _add_tracking(track)
+    _add_output(track)
+    return parser, track
+
+
+def _add_input(track: argparse.ArgumentParser) -> None:
+    """The frames, and what to track in them."""
     track.add_argument("source", type=_existing, metavar="SOURCE", help=SOURCE)
-    track.add_argument("--out", type=Path, required=True, metavar="DIR", help="where results go")
     what = track.add_mutually_exclusive_group()
     what.add_argument(
         "--detections", type=_existing, metavar="FILE", help="MOTChallenge rows, with scores if any"
@@ -109,7 +58,6 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
         "--box", action="append", metavar="x,y,w,h", help="an object in the first frame; repeat it"
     )
     track.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
-    track.add_argument("--seed", type=seed, default=0, help="of the random numbers")
     track.add_argument(
         "--classes", action="store_true", help="the eighth column of detections is their class"
     )
@@ -121,10 +69,17 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
     )
     track.add_argument("--min-score", type=finite, metavar="S", help="leave out weaker detections")
     track.add_argument(
-        "--max-objects", type=whole(1, 1024), metavar="M", help="room for objects at a time"
-    )
-    track.add_argument(
         "--fps", type=positive, metavar="F", help="frames a second, where the source does not say"
+    )
+    truth = "gt.txt to score with, where none is beside img/"
+    track.add_argument("--truth", type=_existing, metavar="FILE", help=truth)
+
+
+def _add_tracking(track: argparse.ArgumentParser) -> None:
+    """How to track."""
+    track.add_argument("--seed", type=seed, default=0, help="of the random numbers")
+    track.add_argument(
+        "--max-objects", type=whole(1, 1024), metavar="M", help="room for objects at a time"
     )
     track.add_argument(
         "--lost-seconds",
@@ -140,8 +95,11 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
         choices=("pixels", "detections"),
         help="what it is found from; by default from pixels, except with --detect and --no-colour",
     )
-    truth = "gt.txt to score with, where none is beside img/"
-    track.add_argument("--truth", type=_existing, metavar="FILE", help=truth)
+
+
+def _add_output(track: argparse.ArgumentParser) -> None:
+    """What to write."""
+    track.add_argument("--out", type=Path, required=True, metavar="DIR", help="where results go")
     track.add_argument("--no-video", action="store_true", help="do not draw tracking.mp4")
     track.add_argument(
         "--format",
@@ -154,25 +112,6 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
         action="store_true",
         help="write an object's first frames too, from before it was believed in",
     )
-    return parser, track
-
-
-def _check(track: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """An error of `track` for options that do not go together."""
-    by_pixels, has_pixels = options.camera_motion == "pixels", _has_pixels(options.source)
-    of_pixels = {"detect": options.detect, "box": options.box, "camera-motion pixels": by_pixels}
-    for name, given in of_pixels.items():
-        if given and not has_pixels:
-            track.error(f"argument --{name}: {options.source} has no pixels")
-    if has_pixels and not (options.detections or options.detect or options.box):
-        track.error("one of the arguments --detections --detect --box is required")
-    if options.detect and by_pixels:
-        track.error("argument --camera-motion pixels: not allowed with --detect")
-    for given, others in _NOT_WITH.items():
-        for name in others if getattr(options, given) else ():
-            if getattr(options, name) not in (None, False):
-                names = (each.replace("_", "-") for each in (name, given))
-                track.error("argument --{}: not allowed with --{}".format(*names))
 
 
 def _existing(text: str) -> Path:
@@ -180,96 +119,3 @@ def _existing(text: str) -> Path:
     if not path.exists():
         raise argparse.ArgumentTypeError(f"{path}: no such file or folder")
     return path
-
-
-def open_source(options: argparse.Namespace) -> Source:
-    """The source of the frames; a `ValueError` for one that cannot be read."""
-    first, last = frames.parse_range(options.frames, "--frames")
-    path, has_pixels = options.source, _has_pixels(options.source)
-    detections = options.detections if has_pixels else _detections_alone(options)
-    unwritten = () if has_pixels and not options.no_video else (VIDEO,)
-    written = [name for name in (*OUTPUTS, FORMATS[options.format]) if name not in unwritten]
-    check_outputs(
-        options.out,
-        written,
-        {"SOURCE": path, "--detections": detections, "--truth": options.truth},
-    )
-    rows, points = None, options.point_deviation is not None
-    if detections is not None:
-        kinds = {"with_classes": options.classes, "points": points}
-        rows = box_files.read_detections(detections, **kinds)
-    folder, info = path, SequenceInfo()
-    if not has_pixels:
-        folder = path if path.is_dir() else sequence_of(path) or path
-        info = read_sequence_info(folder)
-    unscored, end = points or options.box is not None, last
-    truth = None if unscored else find_truth(folder, options.truth, first, last)
-    if rows is not None and not has_pixels:
-        known = [rows[:, :6], *([] if truth is None else [truth.objects])]
-        held = last_frame(info, *known)
-        if last is None and info.length is None:
-            begin = first if options.frames else None
-            rate = options.fps or info.frame_rate or 25
-            of_rows = Rows(np.concatenate(known), coordinates=2 if points else 4)
-            first = first_step(of_rows, begin, rate)
-        last = end = min(last or held, held)
-        if last < first:
-            raise ValueError(f"SOURCE: {path} holds {held} frames, and no frame {first}")
-    elif path.is_dir():
-        held = frames.num_images(path)
-        end = min(last or held, held)
-    num_frames = None if end is None else end - first + 1
-    if rows is not None and options.frames is not None and last is not None:
-        rows = rows[rows[:, 0] <= last]
-    rate = options.fps or (frames.frame_rate(path) if has_pixels else info.frame_rate)
-    return Source(path, has_pixels, rows, first, last, num_frames, rate, info.size, truth)
-
-
-def find_truth(source: Path, given: Path | None, first: int, last: int | None) -> Truth | None:
-    """The truth that was given, or that of a folder of images, in these frames; None without one.
-
-    A video has no folder, and so no truth unless it is given. Warns of a truth beside the images
-    that cannot be read; raises `ValueError` for a given one.
-    """
-    if given is None and not source.is_dir():
-        return None
-    folder = Path(os.path.abspath(source))
-    try:
-        truth = read_truth(given or (folder.parent if folder.name in _INNER else folder))
-    except (ValueError, OSError) as error:
-        if given is not None:
-            raise
-        if not isinstance(error, FileNotFoundError):
-            warnings.warn(f"{NO_SCORES}: {error}", RuntimeWarning, stacklevel=2)
-        return None
-    truth = truth.between(first, last or np.inf)
-    if given is not None and not len(truth.objects):
-        raise ValueError(f"--truth: {given} has no box in these frames")
-    return truth if len(truth.objects) else None
-
-
-def _has_pixels(path: Path) -> bool:
-    """Whether there are frames, and not detections alone."""
-    if path.is_dir():
-        return frames.num_images(path) > 0 or not detection_files(path)
-    return path.suffix.lower() not in _TEXT
-
-
-def _detections_alone(options: argparse.Namespace) -> Path:
-    """The file of detections where there are no pixels: that of the folder, or the source."""
-    path = options.source
-    if options.detections is not None or path.is_file():
-        return options.detections or path
-    files = detection_files(path)
-    files = [file for file in files if file.name == "det.txt"] or files
-    if len(files) > 1:
-        raise ValueError(f"SOURCE: {path} holds {len(files)} files of detections; name one of them")
-    return files[0]
-
-
-def read_boxes(options: argparse.Namespace, still: np.ndarray) -> np.ndarray:
-    """The drawn boxes, each of which has to lie in the first frame."""
-    boxes = np.stack([box_files.parse_box(text, "--box") for text in options.box])
-    height, width, _ = still.shape
-    box_files.check_boxes(boxes, height, width, "--box")
-    return boxes

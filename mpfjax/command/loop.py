@@ -11,17 +11,17 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from mpfjax.command.arguments import (
-    FORMATS,
+from mpfjax.command.arguments import FORMATS, TRACKS
+from mpfjax.command.source import (
     NO_SCORES,
     SCORES,
     SUMMARY,
-    TRACKS,
     VIDEO,
     Source,
     open_source,
     read_boxes,
 )
+from mpfjax.command.source import check_options as check_options
 from mpfjax.console import Clock, peak_memory, write_json
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision.boxes.following import follow_boxes

@@ -9,7 +9,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import real_array, shown
+from mpfjax.arrays import (
+    real_array,
+)
+from mpfjax.checks import shown
 from mpfjax.models.base import real_each, require, with_inputs
 from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.models.observations import Series, as_series

@@ -5,7 +5,11 @@ from typing import Annotated
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import NOT_NEGATIVE, checked, real_array
+from mpfjax.arrays import (
+    NOT_NEGATIVE,
+    real_array,
+)
+from mpfjax.checks import checked
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.law import law_of

@@ -4,7 +4,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from mpfjax.checks import NotNegative, checked, optional, to_rows
+from mpfjax.arrays import (
+    to_rows,
+)
+from mpfjax.checks import (
+    NotNegative,
+    checked,
+)
+from mpfjax.extras import optional
 
 # The kinds of objects and regions that are not scored, in the second column of their rows.
 IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT = 1, 2, 3

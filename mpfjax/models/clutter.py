@@ -8,7 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import POSITIVE, SHARES, Fitting, to_array
+from mpfjax.arrays import (
+    POSITIVE,
+    Fitting,
+    to_array,
+)
+from mpfjax.checks import SHARES
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     is_made_of_noise,

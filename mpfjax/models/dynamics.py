@@ -10,15 +10,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from mpfjax.checks import (
+from mpfjax.arrays import (
     FINITE,
     NOT_NEGATIVE,
     POSITIVE,
-    SHARES,
     Fitting,
-    InnerShare,
     to_array,
     to_numbers,
+)
+from mpfjax.checks import (
+    SHARES,
+    InnerShare,
 )
 from mpfjax.models.gaussians import log_normal
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower

@@ -9,13 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import (
+from mpfjax.arrays import (
     COVARIANCE,
     FINITE,
     Fitting,
+    to_array,
+)
+from mpfjax.checks import (
     check_shape,
     entries,
-    to_array,
 )
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel

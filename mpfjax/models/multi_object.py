@@ -10,7 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import POSITIVE, Checked, Count, Fitting, check_one_each, to_array
+from mpfjax.arrays import (
+    POSITIVE,
+    Fitting,
+    to_array,
+)
+from mpfjax.checks import Checked, Count, check_one_each
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import (
     AbstractStateSpaceModel,

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from mpfjax.operations.logarithms import default_float
-from mpfjax.operations.quantiles import normal_quantile
 from mpfjax.operations.random import (
     bits,
     normal,
+    normal_quantile,
     scrambled_directions,
     shuffled,
     sobol_points,

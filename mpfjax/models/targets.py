@@ -6,7 +6,12 @@ from typing import Annotated, Any
 import equinox as eqx
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import NOT_NEGATIVE, SHARES, Fitting, is_series, to_array
+from mpfjax.arrays import (
+    NOT_NEGATIVE,
+    Fitting,
+    to_array,
+)
+from mpfjax.checks import SHARES, is_series
 from mpfjax.models.base import AbstractStateSpaceModel, mapped, replaced, with_inputs
 from mpfjax.models.births import AbstractBirth
 from mpfjax.models.clutter import PASSED_ON, ClutteredModel, number_or_function

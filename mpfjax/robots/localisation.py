@@ -9,14 +9,16 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Key
 
-from mpfjax.checks import (
+from mpfjax.arrays import (
     POSITIVE,
     Fitting,
+    check_spacing,
+    to_array,
+)
+from mpfjax.checks import (
     NotNegative,
     Rule,
     check,
-    check_spacing,
-    to_array,
     warn,
 )
 from mpfjax.models.base import AbstractStateSpaceModel

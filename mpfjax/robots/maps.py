@@ -10,16 +10,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
-from mpfjax.checks import (
+from mpfjax.arrays import (
     FINITE,
     Fitting,
-    Positive,
     check_spacing,
-    checked,
-    optional,
     to_numbers,
+)
+from mpfjax.checks import (
+    Positive,
+    checked,
     warn,
 )
+from mpfjax.extras import optional
 from mpfjax.models.base import replaced
 
 Poses = Float[Array, "n 3"]

@@ -9,18 +9,20 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.checks import (
+from mpfjax.arrays import (
     NOT_NEGATIVE,
     POSITIVE,
+    Fitting,
+    to_array,
+    to_numbers,
+)
+from mpfjax.checks import (
     Count,
     Exponent,
-    Fitting,
     NotNegative,
     Positive,
     check_shape,
     entries,
-    to_array,
-    to_numbers,
     warn,
 )
 from mpfjax.models.gaussians import log_normal

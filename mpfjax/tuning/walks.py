@@ -10,7 +10,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.checks import POSITIVE, saying
+from mpfjax.arrays import (
+    POSITIVE,
+)
+from mpfjax.checks import saying
 from mpfjax.operations.matrices import cholesky
 from mpfjax.tuning.densities import Point, chosen
 from mpfjax.tuning.problem import Reals

@@ -11,8 +11,8 @@ from PIL import Image
 import mpfjax
 from mpfjax import command
 from mpfjax.command import loop as command_loop
-from mpfjax.command.arguments import find_truth
 from mpfjax.command.loop import scores_of
+from mpfjax.command.source import find_truth
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision.files import frames as frame_files
 from mpfjax.vision.files.boxes import read_tracks, write_tracks

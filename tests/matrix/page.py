@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tests.matrix.filters import MOVES, PAIRS, RECIPES, TRANSFORMS, parts
+from tests.matrix.filters import MOVES, PAIRS, RECIPES, TRANSFORMS
 from tests.matrix.models import FORMS
 from tests.matrix.questions import QUESTIONS
 from tests.matrix.table import APPROXIMATE, RULES, UNSEEN, rules_of

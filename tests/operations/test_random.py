@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import erfinv, log_ndtr
 
 import mpfjax
 from mpfjax.operations.random import (
@@ -11,6 +12,7 @@ from mpfjax.operations.random import (
     bits,
     fast_key,
     normal,
+    normal_quantile,
     split,
     split_for_run,
     split_once,
@@ -100,6 +102,21 @@ class TestNormal:
             for drawn in (normal(KEY, (100,)), jax.random.normal(fast_key(KEY), (100,))):
                 assert drawn.dtype == np.float64
                 np.testing.assert_array_equal(drawn, stock)
+
+    def test_quantiles_over_the_whole_range_of_a_uniform(self):
+        # Every 2^9th of the uniforms that there are, and the last 2^9 at either end.
+        index = np.concatenate(
+            [np.arange(2**9), np.arange(0, 2**23, 2**9), np.arange(2**23 - 2**9, 2**23)]
+        )
+        lowest = np.nextafter(np.float32(-1), np.float32(0))
+        uniforms = (index / 2**23 * 2).astype(np.float32) + lowest
+        quantiles = np.asarray(normal_quantile(jnp.asarray(uniforms)), float)
+        exact = np.sqrt(2) * erfinv(uniforms.astype(float))
+        np.testing.assert_allclose(quantiles, exact, rtol=1e-6, atol=1e-7)
+        tail = -np.abs(quantiles[:20])
+        np.testing.assert_allclose(
+            np.exp(log_ndtr(tail)), (1 - np.abs(uniforms[:20].astype(float))) / 2, rtol=2e-5
+        )
 
 
 class KeySpy(mpfjax.QuadraticModel):

@@ -13,7 +13,7 @@ import mpfjax
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 # What a first filter does not need.
-LATER = {"optax", "chex", "matplotlib", "scipy", "mpfjax.tuning", "mpfjax.metrics", "mpfjax.exact"}
+LATER = {"optax", "chex", "matplotlib", "scipy", "mpfjax.tuning", "mpfjax.metrics", "mpfjax.vision"}
 
 
 def test_the_citation_agrees_with_the_package():
@@ -57,7 +57,8 @@ def test_the_commit_hook_judges_the_subject_alone(message, says, tmp_path):
 def test_the_import_brings_what_a_first_filter_needs_and_the_rest_later():
     """In a new process, as a user's: without the tests' conftest."""
     code = (
-        "import mpfjax, sys; print(*sys.modules)\n"
+        "import mpfjax, sys; assert 'jax' not in sys.modules\n"
+        "mpfjax.particle_filter; print(*sys.modules)\n"
         "for name in ('exact', 'metrics', 'tuning'):\n"
         "    assert name in dir(mpfjax) and getattr(mpfjax, name).__name__ == f'mpfjax.{name}'\n"
         "try: mpfjax.tunning\n"

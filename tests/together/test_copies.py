@@ -14,7 +14,8 @@ MODULES = ("mpfjax", "mpfjax.robots", "mpfjax.tuning", "mpfjax.smoothing", "mpfj
 PUBLIC = {
     name: value
     for module in map(importlib.import_module, MODULES)
-    for name, value in vars(module).items()
+    for name in dir(module)
+    for value in [getattr(module, name)]
     if inspect.isclass(value) and value.__module__.startswith("mpfjax.")
 }
 CLASSES = {

@@ -13,7 +13,10 @@ import pytest
 
 import mpfjax
 from mpfjax import metrics
-from mpfjax.checks import as_numbers, to_array
+from mpfjax.arrays import (
+    to_array,
+)
+from mpfjax.checks import as_numbers
 from mpfjax.exact import kalman_filter
 from mpfjax.vision import Detections
 

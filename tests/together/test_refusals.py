@@ -23,6 +23,7 @@ from mpfjax import (
     KMeans,
     Propagate,
     Resample,
+    arrays,
     checks,
     exact,
     metrics,
@@ -225,7 +226,7 @@ def test_what_an_annotation_rules_out_is_refused_by_name(function):
 
 
 def test_every_public_call_is_tried():
-    public = {name for name, value in vars(mpfjax).items() if callable(value)}
+    public = {name for name in dir(mpfjax) if callable(getattr(mpfjax, name))}
     tried = {function.__name__ for function in GOOD}
     others = {name for name in public - tried if not name.startswith(("_", "Abstract"))}
     # Records of results, what takes no argument to check, and what other tests are about.
@@ -239,7 +240,8 @@ def test_every_public_call_is_tried():
 
 def test_every_number_and_name_of_a_public_call_says_what_it_may_be():
     modules = (mpfjax, tuning, smoothing, vision, exact, metrics, plotting)
-    public = [value for module in modules for value in vars(module).values() if callable(value)]
+    values = [getattr(module, name) for module in modules for name in dir(module)]
+    public = [value for value in values if callable(value)]
     ours = [value for value in public if (value.__module__ or "").startswith("mpfjax.")]
     unsaid = {
         f"{function.__name__}({argument.name})"
@@ -635,17 +637,17 @@ def test_a_mistake_is_named_in_the_first_line(begins, call):
 
 
 def test_arrays_become_those_of_jax():
-    assert checks.to_array("size")([1, 2]).dtype == jnp.float32
-    assert checks.to_array("size", floating=False)([1, 2]).dtype == jnp.int32
+    assert arrays.to_array("size")([1, 2]).dtype == jnp.float32
+    assert arrays.to_array("size", floating=False)([1, 2]).dtype == jnp.int32
     for value in ("a", {}, 1j, KEY, np.ma.masked_array([1.0], [True])):
         with pytest.raises(ValueError, match=r"^size: "):
-            checks.to_array("size")(value)
+            arrays.to_array("size")(value)
 
 
 @pytest.mark.exactness
 def test_traced_values_pass():
     @checks.checked
-    def call(size: Annotated[jax.Array, checks.POSITIVE]):
+    def call(size: Annotated[jax.Array, arrays.POSITIVE]):
         return size
 
     eqx.filter_jit(call)(jnp.array(-1.0))

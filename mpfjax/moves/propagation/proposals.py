@@ -11,7 +11,11 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key
 
-from mpfjax.checks import POSITIVE, Count, Positive, checked, to_array
+from mpfjax.arrays import (
+    POSITIVE,
+    to_array,
+)
+from mpfjax.checks import Count, Positive, checked
 from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractProposal, Step
 from mpfjax.operations.matrices import cholesky, solve_lower

@@ -9,7 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import Count, checked, to_rows
+from mpfjax.arrays import (
+    to_rows,
+)
+from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter, with_densities
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
 from mpfjax.operations.random import split_once

@@ -9,7 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt8
 
-from mpfjax.checks import Count, Positive, check_shape, checked, to_rows
+from mpfjax.arrays import (
+    to_rows,
+)
+from mpfjax.checks import Count, Positive, check_shape, checked
 from mpfjax.models.dynamics import Autoregression
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel, positive_deviations

@@ -10,7 +10,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import shown, to_rows, warn
+from mpfjax.arrays import (
+    to_rows,
+)
+from mpfjax.checks import shown, warn
 
 _COMMENTS = ("#", "%", "//")
 # The names that a header may give to the columns, in lower case and without "_".

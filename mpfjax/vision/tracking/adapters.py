@@ -9,7 +9,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import CountOrZero, checked, is_series, saying, shown, to_rows, warn
+from mpfjax.arrays import (
+    to_rows,
+)
+from mpfjax.checks import CountOrZero, checked, is_series, saying, shown, warn
 from mpfjax.vision.files.boxes import read_detections
 from mpfjax.vision.tracking.detections import Detections
 

@@ -5,7 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from mpfjax.checks import shown, to_numbers, to_rows, warn
+from mpfjax.arrays import (
+    to_numbers,
+    to_rows,
+)
+from mpfjax.checks import shown, warn
 from mpfjax.vision.files.boxes import centred
 from mpfjax.vision.tracking.gaussian import places_of
 from mpfjax.vision.tracking.kinds import BOXES, Kind

@@ -5,7 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from mpfjax.checks import optional, to_rows
+from mpfjax.arrays import (
+    to_rows,
+)
+from mpfjax.extras import optional
 from mpfjax.vision.files.frames import of_one_kind
 from mpfjax.vision.tracking.gaussian import CameraMotion
 

@@ -1,0 +1,171 @@
+"""What the arguments of the command name: the frames, and what is known of them."""
+
+import argparse
+import os
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mpfjax.command.arguments import FORMATS, TRACKS
+from mpfjax.console import check_outputs
+from mpfjax.vision.files import boxes as box_files
+from mpfjax.vision.files import frames
+from mpfjax.vision.files.sequences import (
+    SequenceInfo,
+    Truth,
+    detection_files,
+    last_frame,
+    read_sequence_info,
+    read_truth,
+    sequence_of,
+)
+from mpfjax.vision.tracking.adapters import Rows, first_step
+
+VIDEO, SUMMARY = "tracking.mp4", "summary.json"
+OUTPUTS = (TRACKS, VIDEO, SUMMARY)
+SCORES = ("HOTA", "MOTA", "IDF1")
+NO_SCORES = "no HOTA, MOTA and IDF1"
+_INNER = ("img", "img1")
+_TEXT = (".txt", ".csv")
+_NOT_WITH = {
+    "box": (
+        "max_objects",
+        "min_score",
+        "no_colour",
+        "camera_motion",
+        "offline",
+        "lost_seconds",
+        "classes",
+        "point_deviation",
+        "truth",
+    ),
+    "detect": ("min_score", "classes", "point_deviation"),
+    "point_deviation": ("truth",),
+}
+
+
+class Source(NamedTuple):
+    """The frames to track in, and their metadata."""
+
+    path: Path
+    has_pixels: bool
+    rows: np.ndarray | None  # detections; None where they are yet to be found
+    first: int  # the number of the first frame
+    last: int | None  # None where it is unknown until all frames are read
+    num_frames: int | None
+    frames_per_second: float | None
+    frame_size: tuple[int, int] | None  # None where it is unknown before the frames are read
+    truth: Truth | None
+
+
+def check_options(track: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """An error of `track` for options that do not go together."""
+    by_pixels, has_pixels = options.camera_motion == "pixels", _has_pixels(options.source)
+    of_pixels = {"detect": options.detect, "box": options.box, "camera-motion pixels": by_pixels}
+    for name, given in of_pixels.items():
+        if given and not has_pixels:
+            track.error(f"argument --{name}: {options.source} has no pixels")
+    if has_pixels and not (options.detections or options.detect or options.box):
+        track.error("one of the arguments --detections --detect --box is required")
+    if options.detect and by_pixels:
+        track.error("argument --camera-motion pixels: not allowed with --detect")
+    for given, others in _NOT_WITH.items():
+        for name in others if getattr(options, given) else ():
+            if getattr(options, name) not in (None, False):
+                names = (each.replace("_", "-") for each in (name, given))
+                track.error("argument --{}: not allowed with --{}".format(*names))
+
+
+def open_source(options: argparse.Namespace) -> Source:
+    """The source of the frames; a `ValueError` for one that cannot be read."""
+    first, last = frames.parse_range(options.frames, "--frames")
+    path, has_pixels = options.source, _has_pixels(options.source)
+    detections = options.detections if has_pixels else _detections_alone(options)
+    unwritten = () if has_pixels and not options.no_video else (VIDEO,)
+    written = [name for name in (*OUTPUTS, FORMATS[options.format]) if name not in unwritten]
+    check_outputs(
+        options.out,
+        written,
+        {"SOURCE": path, "--detections": detections, "--truth": options.truth},
+    )
+    rows, points = None, options.point_deviation is not None
+    if detections is not None:
+        kinds = {"with_classes": options.classes, "points": points}
+        rows = box_files.read_detections(detections, **kinds)
+    folder, info = path, SequenceInfo()
+    if not has_pixels:
+        folder = path if path.is_dir() else sequence_of(path) or path
+        info = read_sequence_info(folder)
+    unscored, end = points or options.box is not None, last
+    truth = None if unscored else find_truth(folder, options.truth, first, last)
+    if rows is not None and not has_pixels:
+        known = [rows[:, :6], *([] if truth is None else [truth.objects])]
+        held = last_frame(info, *known)
+        if last is None and info.length is None:
+            begin = first if options.frames else None
+            rate = options.fps or info.frame_rate or 25
+            of_rows = Rows(np.concatenate(known), coordinates=2 if points else 4)
+            first = first_step(of_rows, begin, rate)
+        last = end = min(last or held, held)
+        if last < first:
+            raise ValueError(f"SOURCE: {path} holds {held} frames, and no frame {first}")
+    elif path.is_dir():
+        held = frames.num_images(path)
+        end = min(last or held, held)
+    num_frames = None if end is None else end - first + 1
+    if rows is not None and options.frames is not None and last is not None:
+        rows = rows[rows[:, 0] <= last]
+    rate = options.fps or (frames.frame_rate(path) if has_pixels else info.frame_rate)
+    return Source(path, has_pixels, rows, first, last, num_frames, rate, info.size, truth)
+
+
+def find_truth(source: Path, given: Path | None, first: int, last: int | None) -> Truth | None:
+    """The truth that was given, or that of a folder of images, in these frames; None without one.
+
+    A video has no folder, and so no truth unless it is given. Warns of a truth beside the images
+    that cannot be read; raises `ValueError` for a given one.
+    """
+    if given is None and not source.is_dir():
+        return None
+    folder = Path(os.path.abspath(source))
+    try:
+        truth = read_truth(given or (folder.parent if folder.name in _INNER else folder))
+    except (ValueError, OSError) as error:
+        if given is not None:
+            raise
+        if not isinstance(error, FileNotFoundError):
+            warnings.warn(f"{NO_SCORES}: {error}", RuntimeWarning, stacklevel=2)
+        return None
+    truth = truth.between(first, last or np.inf)
+    if given is not None and not len(truth.objects):
+        raise ValueError(f"--truth: {given} has no box in these frames")
+    return truth if len(truth.objects) else None
+
+
+def _has_pixels(path: Path) -> bool:
+    """Whether there are frames, and not detections alone."""
+    if path.is_dir():
+        return frames.num_images(path) > 0 or not detection_files(path)
+    return path.suffix.lower() not in _TEXT
+
+
+def _detections_alone(options: argparse.Namespace) -> Path:
+    """The file of detections where there are no pixels: that of the folder, or the source."""
+    path = options.source
+    if options.detections is not None or path.is_file():
+        return options.detections or path
+    files = detection_files(path)
+    files = [file for file in files if file.name == "det.txt"] or files
+    if len(files) > 1:
+        raise ValueError(f"SOURCE: {path} holds {len(files)} files of detections; name one of them")
+    return files[0]
+
+
+def read_boxes(options: argparse.Namespace, still: np.ndarray) -> np.ndarray:
+    """The drawn boxes, each of which has to lie in the first frame."""
+    boxes = np.stack([box_files.parse_box(text, "--box") for text in options.box])
+    height, width, _ = still.shape
+    box_files.check_boxes(boxes, height, width, "--box")
+    return boxes
