@@ -1,4 +1,4 @@
-"""Metropolis moves: each x_t moves by a kernel that keeps its own target; the weights stay."""
+"""Metropolis moves: each x_t moves by a kernel that leaves its target invariant."""
 
 import abc
 import math
@@ -41,18 +41,18 @@ class _Target(NamedTuple):
 
 
 class AbstractMetropolis(AbstractMarkovMove):
-    """Steps of Metropolis and Hastings for every particle, given its parent x_{t-1}.
+    """Metropolis-Hastings steps for every particle, given its parent x_{t-1}.
 
-    The move of a resample-move filter (Gilks and Berzuini 2001). After x_t was drawn and weighed,
-    and perhaps resampled, each x_t takes a step of a Markov chain that leaves D(x_t | x_{t-1})
-    L(y_t | x_t) invariant. The weights do not change, Ẑ stays unbiased, and offspring of one
-    particle become distinct. Components keep their mass and their particles. For several steps the
-    chain has the move several times.
+    The move of a resample-move filter (Gilks and Berzuini 2001). After x_t was drawn, weighted and
+    possibly resampled, each x_t takes a step of a Markov chain that leaves D(x_t | x_{t-1}) L(y_t |
+    x_t) invariant. The weights do not change, Ẑ remains unbiased, and the offspring of one particle
+    become distinct. Components keep their weights and their particles. For several steps, list the
+    move several times in the chain.
 
-    Nothing is tuned on the particles that move, since that would not be exact. The length of a step
-    is s times the standard deviation of the dynamics, where log s is uniform between log 0.02 and 0
-    and drawn anew each time. The standard deviation is that of new draws from D(. | x_{t-1}).
-    Integer parts of the state do not move.
+    Nothing is adapted to the particles that move, because this would not be exact. The length of a
+    step is s times the standard deviation of the dynamics, where log s is uniform between log 0.02
+    and 0 and drawn for each step. The standard deviation is estimated from new draws of D(. |
+    x_{t-1}). Integer parts of the state do not move.
 
     - `gradient`: "none" differentiates the draws, "stop" the density of the state after the move,
       as with `gradient` of `Propagate`.
@@ -112,10 +112,10 @@ class AbstractMetropolis(AbstractMarkovMove):
 class RandomWalkMetropolis(AbstractMetropolis):
     """Metropolis steps by a random walk: x' = x + s (a - b) / √2 with a, b ~ D(. | x_{t-1}).
 
-    The difference of two draws from the dynamics is symmetric and has twice their covariance. Every
-    particle therefore walks in the units and along the correlations of its own dynamics.
-    Differential evolution (ter Braak 2006) uses differences of particles in the same way, but is
-    not exact here. See `AbstractMetropolis`, which has the arguments.
+    The difference of two draws from the dynamics is symmetric and has twice their covariance, so
+    every particle walks in the units and along the correlations of its own dynamics. Differential
+    evolution (ter Braak 2006) uses differences of particles in the same way, but is not exact here.
+    `AbstractMetropolis` describes the arguments.
 
     Each step takes two draws of the dynamics, and one evaluation of D and L. Use it after a
     resampling that leaves few distinct particles.

@@ -1,4 +1,4 @@
-"""Which measurement is whose: joint probabilities of pairs by loopy belief propagation."""
+"""Data association: joint probabilities of pairs by loopy belief propagation."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Objects that come and go: a component for each, by the probabilities of all associations."""
+"""Objects that appear and disappear: one component each, with all associations marginalised."""
 
 from typing import NamedTuple
 
@@ -51,39 +51,40 @@ class _Intensity(NamedTuple):
 
 
 class Associate(AbstractWrapper):
-    """Weigh the objects by a scan's measurements, over all associations, and start new ones.
+    """Weight the objects by the measurements of a scan, over all associations, and start new ones.
 
-    A Poisson multi-Bernoulli filter (Williams 2015) in particles, with the marginal probabilities
-    of associations by belief propagation (Williams and Lau 2014; Meyer et al. 2018). The joint
-    weights are the intensity u of the objects, normalised. Multiply them by the expected number of
-    objects, which the memory holds, to have u. The u of component m >= 1 sum to the probability r_m
-    that its object exists, those of component 0 to the expected number of objects that no
-    measurement has revealed yet. After a `Predict`, with G_j = p_D N(y_j | x) / λ(y_j),
+    A particle implementation of the Poisson multi-Bernoulli filter (Williams 2015), with marginal
+    association probabilities by belief propagation (Williams and Lau 2014; Meyer et al. 2018). The
+    joint weights are the normalised intensity u of the objects; multiplied by the expected number
+    of objects, which is stored in the memory, they are u. The u of component m >= 1 sum to the
+    existence probability r_m of its object, those of component 0 to the expected number of
+    undetected objects. After a `Predict`, with G_j = p_D N(y_j | x) / λ(y_j),
 
-    1. Two components become one where they describe one object, begun at different measurements:
-       their means are within two pooled deviations in each number of the state, and their r add up
-       to one at most. u is multiplied by p_S, and new objects join component 0.
+    1. Two components are merged if they describe one object that was started by different
+       measurements: their means are within two pooled standard deviations in each component of the
+       state, and their r sum to at most one. u is multiplied by p_S, and new objects are added to
+       component 0.
     2. Each measurement may be the first of an object, whose particles are drawn ∝ G_j u from
-       component 0, and from those that the birth proposes at the measurement.
+       component 0, and from those that the birth model proposes at the measurement.
     3. Each u becomes u (1 - p_D) P(m has none) / P₀ + Σ_j u G_j P(m has j) / Σ_m u G_j, with the
        probabilities of `associate`, and u (1 - p_D) in component 0.
-    4. The M most probable objects stay, the first in component 1. Others, and those below
-       1e-4, go to component 0 and are no longer told apart, so that none is lost
+    4. The M most probable objects are retained, the first in component 1. Others, and those below
+       1e-4, are moved to component 0 and are no longer distinguished, so that none is lost
        (Williams 2012).
     5. Each component is resampled, by `resample`, and component 0 systematically.
 
-    The mass grows by log p of the scan over that of clutter alone, as that of `ClutteredModel`.
-    Approximate are belief propagation, whose log p is Bethe's, and exact where no two objects
-    compete for two measurements; components that become one; step 4; and the product form after
-    each scan. Labels count objects up from 1. They are not identities once two objects have been
-    close, whoever computes them. `memory["targets"]` holds the number, the labels, and how many
-    objects were crowded out.
+    The total weight grows by log p of the scan over log p of clutter alone, as in `ClutteredModel`.
+    Four steps are approximate: belief propagation, whose log p is Bethe's, and exact if no two
+    objects compete for two measurements; the merging of components; step 4; and the product form
+    after each scan. Labels count objects from 1. They are not identities once two objects have been
+    close, for any filter. `memory["targets"]` contains the number, the labels, and how many objects
+    were crowded out.
 
-    - `particles_per_birth`: the particles of a new object at each measurement.
-    - `undetected_particles`: those of component 0, which fill the first slots.
-    - `resample`: how each object is drawn anew, with the particles that its weight earns.
+    - `particles_per_birth`: the number of particles of a new object at each measurement.
+    - `undetected_particles`: the number of particles of component 0, which fill the first slots.
+    - `resample`: the move that redraws each object, with a number of particles by its weight.
 
-    Raises `ValueError` on islands, for `slots`, and without slots for the objects.
+    Raises `ValueError` on islands, for `slots`, and if there are no slots for the objects.
     """
 
     particles_per_birth: Count = eqx.field(static=True, default=50, kw_only=True)
@@ -98,7 +99,7 @@ class Associate(AbstractWrapper):
     keeps_families = False
 
     def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
-        """The expected number, and the labels of all components, 0 of one without an object."""
+        """The expected number, and the labels of all components, 0 for one without an object."""
         memory = {
             "number": getattr(now.model, "initial_number", jnp.zeros(())),
             "labels": jnp.zeros(num_components, jnp.int32),
@@ -108,7 +109,7 @@ class Associate(AbstractWrapper):
         return {TARGETS: memory} | super().initial_memory(now, num_components)
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
-        """Raise a `ValueError` for a model of another kind, and where objects have no room."""
+        """Raise a `ValueError` for a model of another kind, and if there is no room for objects."""
         check(TargetsModel, model=now.model)
         if num_components < 2:
             raise ValueError("num_components: 1 is that of objects not detected; it has no other")

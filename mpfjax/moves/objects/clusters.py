@@ -1,4 +1,4 @@
-"""Clusters of objects: particle filters of their own that merge where objects meet."""
+"""Clusters of objects: separate particle filters that merge when objects meet."""
 
 from typing import Any, Literal
 
@@ -26,59 +26,57 @@ from mpfjax.operations.stored import take
 
 
 class PropagateInClusters(AbstractPropagationByObject):
-    """Propagate, weigh and resample clusters of objects, which merge where objects meet.
+    """Propagate, weight and resample clusters of objects, which merge when objects meet.
 
-    Each object belongs to one cluster. A cluster has N rows, and a row holds a state of each of
-    its objects. The joint distribution is the product of the clusters' distributions. At the
-    start every object is a cluster of its own. One step, from rows of equal weight:
+    Each object belongs to one cluster. A cluster has N rows, and a row contains a state of each of
+    its objects. The joint distribution is the product of the clusters' distributions. At time 0
+    every object is a separate cluster. One step, from rows of equal weight:
 
     1. *Predict.* Object j's point x^{jl} is drawn by its dynamics from row l, and L_j evaluated.
-    2. *Merge.* Clusters become one where log ψ ≠ 0 between any points of two of their objects,
+    2. *Merge.* Clusters are merged if log ψ ≠ 0 between any points of two of their objects,
        directly or through others. Row l of the new cluster is row l of each.
-    3. *An object alone* is resampled by its likelihood. The mean likelihood is its factor of Ẑ.
-    4. *Objects in a cluster are recombined.* Object j's N points are a draw of
-       q_j(x) = N⁻¹ Σ_r f_j(x | row r), the deterministic mixture of Owen and Zhou (2000), and
-       serve every row r with the weight
+    3. *A single object* is resampled by its likelihood. The mean likelihood is its factor of Ẑ.
+    4. *Objects in a cluster are recombined.* Object j's N points are a draw of q_j(x) = N⁻¹ Σ_r
+       f_j(x | row r), the deterministic mixture of Owen and Zhou (2000), and serve every row r with
+       the weight
 
            b_rjl = L_j(x^{jl}) f_j(x^{jl} | row r) / Σ_r' f_j(x^{jl} | row r').
 
        The update of row r is Σ b_r1l b_r2m ... ψ(x^{1l}, x^{2m}) ... over all combinations of
-       points. First, N rows are drawn with probability ∝ Π_j Σ_l b_rjl. Then each row draws a
-       point for one object after the other, ∝ b times ψ with the points that it has already, and
-       its weight is multiplied by Σ_l b ψ / Σ_l b. Different rows start with different objects.
-       Last, the weighted rows are resampled. The factor of Ẑ is the mean score times the mean
-       weight.
-    5. The rows of every cluster are shifted, in a circle, by a random number of places.
+       points. First, N rows are drawn with probability ∝ Π_j Σ_l b_rjl. Then each row draws a point
+       for one object after the other, ∝ b times ψ with the points drawn so far, and its weight is
+       multiplied by Σ_l b ψ / Σ_l b. Different rows start with different objects. Last, the
+       weighted rows are resampled. The factor of Ẑ is the mean score times the mean weight.
+    5. The rows of every cluster are shifted, in a circle, by a random number of slots.
 
     Why it is unbiased. Given the rows, the points of different objects are independent. Each
-    object's weighted points are an unbiased estimate of its prediction under any row. So the sum
-    over combinations is an unbiased estimate of the cluster's update. Given the past, clusters
-    are independent, so the expectation of their product is the product of the exact updates.
-    Where ψ is 1 for all combinations of points of two clusters, that product is the joint update.
-    After step 5 all pairs of rows of two clusters are equally likely to stand side by side, so a
-    merged cluster is an unbiased estimate of the product. Whether two clusters merge depends on
-    the points alone, not on which rows stand side by side.
+    object's weighted points are an unbiased estimate of its prediction under any row, so the sum
+    over combinations is an unbiased estimate of the cluster's update. Given the past, clusters are
+    independent, so the expectation of their product is the product of the exact updates. If ψ is 1
+    for all combinations of points of two clusters, that product is the joint update. After step 5
+    all pairs of rows of two clusters are equally likely to be aligned, so a merged cluster is an
+    unbiased estimate of the product. Whether two clusters merge depends on the points alone, not on
+    which rows are aligned.
 
-    In partitioned sampling, the evidence of one object removes hypotheses about another, in any
-    order. Here it does not, and no object goes first in all rows.
+    In partitioned sampling, the evidence of one object eliminates hypotheses about another, in any
+    order. Here it does not, and no object is first in all rows.
 
-    - `start`: every object "apart", or all "together" in one cluster, as for an x_0 under which
-      the objects are not independent.
-    A cluster never splits, since its objects are not independent any more.
+    - `start`: every object "apart", or all "together" in one cluster, for an x_0 under which the
+      objects are dependent. A cluster never splits, because its objects remain dependent.
 
-    Cost: J x N likelihoods a step, J(J-1) N² / 2 potentials to find contact, and 2 N² J
-    transition densities and J² N² potentials where there is a cluster of several.
+    Cost: J x N likelihoods per step, J(J-1) N² / 2 potentials to detect contact, and 2 N² J
+    transition densities and J² N² potentials if there is a cluster of several.
 
-    Particle i holds row i of every cluster. The move needs particles of equal weight, as x_0 has
-    and as it returns them. A row has no single ancestor, and -1 for its index.
-    `memory["clusters"]["labels"]`, (J,), holds the first object of each object's cluster.
+    Particle i contains row i of every cluster. The move requires particles of equal weight, which
+    x_0 has and which it returns. A row has no single ancestor, and the index -1.
+    `memory["clusters"]["labels"]`, (J,), contains the first object of each object's cluster.
 
-    Clusters need `log_transition` of the object model. A model whose state holds more than x_t,
-    such as x_{t-1}, also needs `with_history(states, previous_states)`: the states with their past
-    taken from the previous states.
+    Clusters require `log_transition` of the object model. A model whose state contains more than
+    x_t, such as x_{t-1}, also requires `with_history(states, previous_states)`: the states with
+    their past taken from the previous states.
 
-    Raises `ValueError` for a mixture of several components, a model of one object, a model
-    without `log_transition` where it is needed, and an unknown `start`.
+    Raises `ValueError` for a mixture of several components, a model of one object, a model without
+    `log_transition` if it is required, and an unknown `start`.
     """
 
     start: Literal["apart", "together"] = eqx.field(static=True, default="apart")
@@ -86,7 +84,7 @@ class PropagateInClusters(AbstractPropagationByObject):
     approximate = False
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
-        """Raise a `ValueError` for a model of one object, or without the density it needs."""
+        """Raise a `ValueError` for a model of one object, or without the density it requires."""
         super().check(now, num_particles, num_components)
         if self._may_be_joint(now.model):
             require(now.model.object_model, "log_transition", "PropagateInClusters")
@@ -97,7 +95,7 @@ class PropagateInClusters(AbstractPropagationByObject):
         return joins and model.num_objects > 1
 
     def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
-        """The clusters' labels."""
+        """The labels of the clusters."""
         labels = jnp.arange(now.model.num_objects, dtype=jnp.int32)
         labels = jnp.zeros_like(labels) if self.start == "together" else labels
         return {"clusters": {"labels": labels}}

@@ -18,21 +18,21 @@ class Exclusion(AbstractPropagation, ByFeatures):
 
         log-weight_i -= strength · Σ_{m ≠ c_i} exp(-|x_i - μ_m|² / (2 radius²))
 
-    The sum runs over living components. μ_m is the plain mean of the propagated particles of
-    component m: the mean of its prediction when every step resamples. Distances are in units of
-    `scale`; the nearness of a mean is nearly 0 at three times the radius.
+    The sum is over active components. μ_m is the unweighted mean of the propagated particles of
+    component m: the mean of its prediction if every step resamples. Distances are in units of
+    `scale`; the repulsion is nearly 0 at three times the radius.
 
-    - `group`: a function that gives each particle the whole number of its object, the same within a
-      component, as that of `Prune` does. Components of one object are then rival hypotheses, which
-      do not repel each other, and each counts by its share of its object's mass. None has an object
-      for each component.
+    - `group`: a function that returns the number of each particle's object, the same within a
+      component, as for `Prune`. Components of one object are then rival hypotheses, which do not
+      repel each other, and each is weighted by its share of its object's weight. None assigns a
+      different object to each component.
 
     This is NOT part of the exact recursion of any paper here. Components interact as objects do in
     a Markov random field, but through their means instead of their states. The filtering
     distribution is then not that of the model, and the marginal likelihood is biased (`approximate`
-    is true). Use it after `Propagate`, where each component stands for an object, objects cannot
-    share a place, and several components would otherwise end on one look-alike. Never use it where
-    components are hypotheses about ONE object, unless `group` says so.
+    is true). Use it after `Propagate`, if each component represents an object, objects cannot share
+    a position, and several components would otherwise end on one of several similar objects. Never
+    use it if components are hypotheses about ONE object, unless `group` declares this.
 
     Raises `ValueError` for a strength or radius that is not positive.
     """

@@ -1,4 +1,4 @@
-"""Independent objects: a small particle filter for each, in one mixture."""
+"""Independent objects: a separate particle filter for each, in one mixture."""
 
 import equinox as eqx
 import jax
@@ -30,17 +30,16 @@ class AbstractPropagationByObject(AbstractPropagation):
 
 
 class PropagateIndependently(AbstractPropagationByObject):
-    """Propagate, weigh and resample each object on its own, as if there were no other.
+    """Propagate, weight and resample each object separately, ignoring the other objects.
 
-    For every object j: x_t^j ~ D, weights L(y_t | x_t^j), resampled by these weights alone.
-    Objects that do not interact are independent given the observations, so the product of their
-    N-particle clouds is the joint cloud, with Ẑ = Π_j Ẑ_j. Particle i holds the i-th particle
-    of every object: it is one of N^J combinations of equal weight. It has no single ancestor, and
-    -1 for its index.
+    For every object j: x_t^j ~ D, weights L(y_t | x_t^j), resampled by these weights alone. Objects
+    that do not interact are independent given the observations, so the product of their N-particle
+    sets is the joint set, with Ẑ = Π_j Ẑ_j. Particle i contains the i-th particle of every object:
+    it is one of N^J combinations of equal weight. It has no single ancestor, and the index -1.
 
-    The move needs particles of equal weight, as x_0 has and as it returns them; the chain needs no
-    other resampling. It refuses a model with an interaction, unless `ignores_interaction`, which is
-    `approximate`. Raises `ValueError` for a mixture of several components, and a model of one
+    The move requires particles of equal weight, which x_0 has and which it returns; the chain needs
+    no other resampling. It refuses a model with an interaction, unless `ignores_interaction`, which
+    is `approximate`. Raises `ValueError` for a mixture of several components, and a model of one
     object.
     """
 

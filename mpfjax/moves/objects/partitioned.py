@@ -31,29 +31,30 @@ Reassembly = Literal["evidence", "prior"]
 class Partitioned(AbstractPropagation, AbstractWrapper):
     """Propagate one object after the other, resampling after each but the last.
 
-    Smith and Gatica-Perez (2004), section 3: object j moves by its dynamics, the particles are
-    resampled by importance weights ρ_i in proportion to a weight function g, and weights are
-    divided by ρ_i. Here g is the object's factor of the target: its own likelihood, and its
-    potentials ψ with the objects that have moved before it. Each g is multiplied into the joint
-    weights. Resampling in proportion to the weights, with equal shares for the offspring, is then
-    the same as the division. After the last object the weights hold L(y_t | x_t) D / q of the whole
-    joint state, and Ẑ is unbiased in every order. Everything happens within components.
+    Smith and Gatica-Perez (2004), section 3: object j is propagated by its dynamics, the particles
+    are resampled by importance weights ρ_i in proportion to a weight function g, and weights are
+    divided by ρ_i. Here g is the object's factor of the target: its likelihood, and its potentials
+    ψ with the objects propagated before it. Each g is multiplied into the joint weights. Resampling
+    in proportion to the weights, with equal shares for the offspring, is then equivalent to the
+    division. After the last object the weights contain L(y_t | x_t) D / q of the whole joint state,
+    and Ẑ is unbiased for every order. All resampling is within components.
 
-    - `orders`: the order in which objects move, counted from 0. One order for all components; one
-      order for each component; "circular", where component c starts with object c, then c + 1, and
-      so on in a circle; or "random", a new order for each component at every step. None is 0, ...,
-      J-1.
+    - `orders`: the order in which objects are propagated, counted from 0. One order for all
+      components; one order for each component; "circular", in which component c starts with object
+      c, then c + 1, and so on in a circle; or "random", a new order for each component at every
+      step. None is 0, ..., J-1.
     - `resample`: the resampling after each object; by default systematic, at every object, with
-      equal shares of the slots. With its gradient "stop" the objects' draws are constants too, and
+      equal allocation. With its gradient "stop" the objects' draws are constants too, and
       derivatives pass through their densities, as in `Propagate`.
-    - `reassembly`: the masses of the components afterwards (section 4 and eq. 5). "evidence"
-      multiplies each mass by the component's evidence, eq. 4 of Vermaak et al. (2003). "prior" is
-      the paper's: each component returns to the mass that it had before, and only the total grows
-      by the evidence. The marginal likelihood is then biased (`approximate` is true), but one step
-      of bad luck loses no component. With one component both are the same.
+    - `reassembly`: the weights of the components afterwards (section 4 and eq. 5). "evidence"
+      multiplies each weight by the component's evidence, eq. 4 of Vermaak et al. (2003). "prior" is
+      the paper's: each component returns to its previous weight, and only the total grows by the
+      evidence. The marginal likelihood is then biased (`approximate` is true), but no component is
+      lost by a single unlucky step. With one component both are the same.
 
-    A component dies if an object leaves it without weight. The others share its slots and, with
-    "prior", its mass. If all weight is lost, the particles move by their dynamics alone.
+    A component is lost if an object leaves it without weight. The others share its slots and, with
+    "prior", its weight. If all weight is lost, the particles are propagated by their dynamics
+    alone.
 
     Raises `ValueError` for orders that are no permutations, and an unknown reassembly; in a filter,
     for a model of one object, an order that is no permutation of its objects, and a number of
@@ -78,7 +79,7 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
 
     @property
     def approximate(self) -> bool:
-        """Whether components return to the mass that they had before."""
+        """Whether components return to their previous weight."""
         return self.reassembly == "prior"
 
     @property

@@ -1,4 +1,4 @@
-"""Nested propagation: each particle draws several x_t, and one of them is kept."""
+"""Nested propagation: each particle draws several x_t, one of which is retained."""
 
 import math
 
@@ -16,20 +16,21 @@ from mpfjax.operations.stored import take
 
 
 class PropagateNested(AbstractPropagationOfEach, AbstractWrapper):
-    """Draw K of x_t for each particle, and keep one by its weight.
+    """Draw K values of x_t for each particle, and retain one by its weight.
 
-    Draw x_t^ik of particle i has the factor g_ik = L D / q. The particle is weighed by the mean of
-    its factors, (1 / K) Σ_k g_ik, and keeps draw k with the probability g_ik / Σ_j g_ij. This is
+    Draw x_t^ik of particle i has the factor g_ik = L D / q. The particle is weighted by the mean of
+    its factors, (1 / K) Σ_k g_ik, and retains draw k with probability g_ik / Σ_j g_ij. This is
     nested sequential Monte Carlo in its simplest form (Naesseth, Lindsten and Schön 2015): a filter
-    of K N particles that keeps one child of each parent. Ẑ is that of K N particles, and unbiased.
-    The model is evaluated K N times, but only N particles are resampled, sorted and regrouped.
+    of K N particles that retains one child of each parent. Ẑ is the estimate of K N particles, and
+    unbiased. The model is evaluated K N times, but only N particles are resampled, sorted and
+    regrouped.
 
     - `propagate`: the `Propagate` that draws. With its noise "rqmc" all K N draws are one point
-      set, of which the draws of a particle are neighbours.
+      set, in which the draws of a particle are neighbours.
     - `num_draws`: K.
 
-    Raises `ValueError` for K < 1, and for gradient "stop", which does not see which draw was
-    kept. Use it where the likelihood is narrow and cheap, with four to sixteen draws.
+    Raises `ValueError` for K < 1, and for gradient "stop", which ignores the choice among the
+    draws. Use it if the likelihood is narrow and cheap, with four to sixteen draws.
     """
 
     propagate: Propagate

@@ -1,4 +1,4 @@
-"""Propagation from t-1 to t: the bootstrap proposal, and any proposal with its own density."""
+"""Propagation from t-1 to t: the bootstrap proposal, and any proposal with a density."""
 
 from typing import Any
 
@@ -82,23 +82,24 @@ class Propagate(Draw, AbstractPropagationOfEach):
     """Draw x_t and multiply the weights by L(y_t | x_t) D(x_t | x_{t-1}) / q(x_t | x_{t-1}, y_t).
 
     This is the weight update of Vermaak et al. (2003), section 3. With joint weights, ordinary
-    normalisation then updates the mixture weights as well (eq. 4). Without a proposal, q is the
-    dynamics D, and the factor is L alone. With a proposal it is the guided filter. Use one where
-    the likelihood is much narrower than the dynamics.
+    normalisation also updates the mixture weights (eq. 4). Without a proposal, q is the dynamics D,
+    and the factor is L alone. With a proposal it is the guided filter. Use one if the likelihood is
+    much narrower than the dynamics.
 
-    - `gradient`: what a derivative sees; the values are the same. "none" differentiates the draw
+    - `gradient`: what is differentiated; the values are the same. "none" differentiates the draw
       x_t = f(x_{t-1}, noise; θ). "stop" treats the draw as a constant and the factor as L D / ⊥q,
       where ⊥ is `stop_gradient` (Ścibior and Wood 2021). Parameters of D then have a gradient
-      through its density, and parameters of q have none. The draw of x_0 is still
-      differentiated.
-    - `noise`: what x_t is made of. "independent": each particle has noise of its own, as the
-      model's `sample_transition` or the proposal draws it. "rqmc" spreads the noise evenly over
-      the slots of each component. Every particle's own law stays the same, so Ẑ stays unbiased.
-      It is a randomised point set over slot and noise, of Sobol for noise of two dimensions or
-      more (L'Ecuyer, Lécot and Tuffin 2008; Gerber and Chopin 2015). Most is gained where a
-      `Resample(sort_by="hilbert")` has put the particles in order in the same step. Where none
-      has, as without an observation, the points are dealt to the particles anew, and errors are
-      about those of independent noise. Take it where masses and likelihoods must be accurate.
+      through its density, and parameters of q have none. The draw of x_0 is differentiated in both
+      cases.
+    - `noise`: the noise of x_t. "independent": each particle has independent noise, drawn by the
+      model's `sample_transition` or by the proposal. "rqmc" distributes the noise evenly over the
+      slots of each component. The distribution of every single particle does not change, so Ẑ
+      remains unbiased. The noise is a randomised point set over slot and noise, a Sobol set for
+      noise of two dimensions or more (L'Ecuyer, Lécot and Tuffin 2008; Gerber and Chopin 2015). The
+      gain is largest if a `Resample(sort_by="hilbert")` has ordered the particles in the same step.
+      If none has, as without an observation, the points are assigned at random, and errors are
+      about as large as with independent noise. Use it if mixture weights and likelihoods must be
+      accurate.
 
     Raises `ValueError` for another gradient or noise; in a filter, for a proposal, or "stop", with
     a model that has no `log_transition`; and for noise that is not independent, with a model that
@@ -109,9 +110,9 @@ class Propagate(Draw, AbstractPropagationOfEach):
 class Predict(Draw):
     """Draw x_t and multiply the weights by D / q alone: the first half of a `Propagate`.
 
-    `Reweight` is the second half. Use the two in a chain that does something in between, such as
+    `Reweight` is the second half. Use the two in a chain with other moves in between, such as
     redrawing the prediction from its Gaussian (Lin et al. 2012, section 4, step 3). The arguments
-    and errors are those of `Propagate`; without a proposal the weights stay as they are.
+    and errors are those of `Propagate`; without a proposal the weights do not change.
     """
 
     weighs = False
@@ -121,7 +122,7 @@ class Predict(Draw):
 class Reweight(AbstractPropagation):
     """Multiply the weights by L(y_t | x_t): the second half of a bootstrap `Propagate`.
 
-    Use it after `Predict` and what a chain does to the prediction.
+    Use it after `Predict` and moves that change the prediction.
     """
 
     approximate = False

@@ -1,4 +1,4 @@
-"""Proposals q(x_t | x_{t-1}, y_t) with a density of their own."""
+"""Proposals q(x_t | x_{t-1}, y_t) whose density is known."""
 
 import abc
 import math
@@ -76,21 +76,22 @@ _HIDDEN = 16, 2
 
 
 class NetworkProposal(_GaussianProposal):
-    """A Gaussian whose mean and deviations a network gives, from x_{t-1} and y_t.
+    """A Gaussian whose mean and standard deviations are computed by a network from x_{t-1} and y_t.
 
     q = N(x_{t-1} + s a, diag(s exp b)²), (a, b) = network(x_{t-1}, y_t), for each particle. The
-    network learns from the bound E[log Ẑ] <= log Z: the better q fits, the higher is E[log Ẑ].
-    `tuning.fit` maximises it in the network's arrays (Maddison et al. 2017, FIVO). Take
+    network is trained by the bound E[log Ẑ] <= log Z: the better q fits, the higher is E[log Ẑ].
+    `tuning.fit` maximises it over the network's arrays (Maddison et al. 2017, FIVO). Use
     `gradient="none"`: as in that paper, it differentiates the draws and not the resampling. The
-    filter is exact whatever the network is.
+    filter is exact for any network.
 
     - `network`: a function of one vector, the flattened state followed by the flattened
-      observation. It returns a vector of twice the state's size: a, then b. `create` makes such
-      an `eqx.nn.MLP`.
+      observation. It returns a vector of twice the state's size: a, then b. `create` makes such an
+      `eqx.nn.MLP`.
     - `scale`: s, (d,) or a scalar, positive, in units of the state: about the length of a step.
 
-    Raises `ValueError` for a scale that is not positive. Use it where the likelihood is narrow,
-    no `GaussNewtonProposal` fits, and the same model runs often enough to repay the training.
+    Raises `ValueError` for a scale that is not positive. Use it if the likelihood is narrow,
+    `GaussNewtonProposal` is not applicable, and the same model runs often enough to repay the
+    training.
     """
 
     network: Callable[[Float[Array, " k"]], Float[Array, " two_d"]]
@@ -105,7 +106,7 @@ class NetworkProposal(_GaussianProposal):
         observation_size: Count,
         scale: float | Float[Array, " d"],
     ) -> "NetworkProposal":
-        """An untrained one: a small network, whose draws are about N(x_{t-1}, scale²)."""
+        """An untrained proposal: a small network that draws approximately N(x_{t-1}, scale²)."""
         sizes = (state_size + observation_size, 2 * state_size)
         network = eqx.nn.MLP(*sizes, *_HIDDEN, jax.nn.tanh, key=key)
         last = jax.tree.map(lambda leaf: 0.1 * leaf, network.layers[-1])
@@ -134,14 +135,14 @@ class GaussNewtonProposal(_GaussianProposal):
     Each iteration linearises h at the current point, with its Jacobian H by JAX, and solves for the
     mean of the resulting Gaussian, whose precision is Λ = Q⁻¹ + Hᵀ R⁻¹ H (Doucet, Godsill and
     Andrieu 2000, section II.D, local linearisation). The draw is from N(mean, inflation² Λ⁻¹). An
-    inflation above one keeps the weights bounded if the Gaussian is narrower than the target. It
-    costs no exactness, as weights correct for it.
+    inflation above one keeps the weights bounded if the Gaussian is narrower than the target,
+    without loss of exactness, because the weights correct for it.
 
-    The model has `transition_mean`, `observation_mean`, `transition_covariance`, (d, d), and
-    `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.
+    The model must define `transition_mean`, `observation_mean`, `transition_covariance`, (d, d),
+    and `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.
 
-    Raises `ValueError` for no iterations, or an inflation not above 0, and in a filter of a model
-    without these means. Use it where bootstrap particles mostly miss the likelihood.
+    Raises `ValueError` for no iterations, or an inflation that is not positive, and in a filter of
+    a model without these means. Use it if most bootstrap particles miss the likelihood.
     """
 
     num_iterations: Count = eqx.field(static=True, default=4)
@@ -168,9 +169,8 @@ class GaussNewtonProposal(_GaussianProposal):
         """log p(y_t | x_{t-1}) of every particle by the fitted Gaussian, shape (n,).
 
         Laplace's approximation of log ∫ L D dx_t: log L + log D at the mean, and the volume
-        (2π)^(d/2) |Λ|^(-1/2) around it. It is exact where h is linear, as in a
-        `LinearGaussianModel`. It does not depend on the inflation. Use it as the look-ahead of
-        `AuxiliaryResample`.
+        (2π)^(d/2) |Λ|^(-1/2) around it. It is exact if h is linear, as in a `LinearGaussianModel`.
+        It does not depend on the inflation. Use it as the look-ahead of `AuxiliaryResample`.
         """
         means, factors = self._fit(now, previous_states)
         states = means.reshape(previous_states.shape)

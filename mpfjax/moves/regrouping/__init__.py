@@ -1,1 +1,1 @@
-"""Moves that rewrite component indicators and leave the distribution as it is."""
+"""Moves that change component indicators and leave the distribution unchanged."""

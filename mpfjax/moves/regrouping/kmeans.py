@@ -1,4 +1,4 @@
-"""K-means: every particle to the nearest centroid, each centroid to the mean of its particles."""
+"""K-means: particles are assigned to the nearest centroid, centroids moved to their means."""
 
 import equinox as eqx
 import jax
@@ -18,18 +18,19 @@ _AT_ONCE = 16
 
 
 class KMeans(AbstractRegrouping, ByFeatures):
-    """Assign particles to the nearest component, by K-means from the components as they are.
+    """Assign particles to the nearest component, by K-means from the existing components.
 
-    Vermaak et al. (2003), section 4. Every particle counts the same, whatever its weight, so that
-    the components cover all places that hold particles. On the quadratic model, K-means by weight
-    loses modes. A component keeps its label. A component without a particle is dead and stays dead.
+    Vermaak et al. (2003), section 4. Every particle counts equally, regardless of its weight, so
+    that the components cover all regions with particles. On the quadratic model, K-means by weight
+    loses modes. A component keeps its label. A component without particles is empty and remains
+    empty.
 
     - `num_iterations`: how often all particles are assigned; the centroids move in between.
     - `reseed`: start from all M components instead, seeded by farthest-first traversal from the
-      particle farthest from the mean. For the grouping of x_0.
-    - `features`: maps the particles to the numbers by which they are near or far, (n,) or (n, k);
-      None takes the whole state, flattened.
-    - `scale`: the unit of each feature, or one for all. Distances are measured in it.
+      particle farthest from the mean. Use it to group x_0.
+    - `features`: maps the particles to the coordinates by which distances are measured, (n,) or (n,
+      k); None uses the whole state, flattened.
+    - `scale`: the unit of each feature, or one for all.
 
     Raises `ValueError` for fewer than one iteration, and a scale that is not positive.
     """
@@ -38,7 +39,7 @@ class KMeans(AbstractRegrouping, ByFeatures):
     reseed: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
-        """Each particle to the component whose centroid is nearest."""
+        """The component with the nearest centroid, for each particle."""
         features, occupied, m = self.features_of(mixture), mixture.occupied, mixture.num_components
         if self.reseed:
             labels = farthest_first(features, occupied, m)

@@ -1,4 +1,4 @@
-"""Merge: components that overlap become one. Prune: improbable components are emptied."""
+"""Merge joins components that overlap; Prune empties improbable components."""
 
 from collections.abc import Callable
 
@@ -25,19 +25,20 @@ class Merge(AbstractRegrouping, ByFeatures):
     """Merge components that overlap, after they have done so `patience` times in a row.
 
     Vermaak et al. (2003), section 4, leaves the criterion open. Here two components overlap when
-    both hold:
+    both of these hold:
 
     - their means are less than `max_deviations` pooled standard deviations apart, along the line
-      through both means (Ashman's D; at 1 two equal Gaussians share 62% of their mass, at 2 32%);
+      through both means (Ashman's D; two equal Gaussians share 62% of their mass at 1, and 32% at
+      2);
     - their means are less than `max_distance` apart, in units of `scale`.
 
-    None leaves out a condition. `patience` is the number of times in a row that they must overlap
-    before they merge, so that two objects that pass each other do not become one. It counts runs of
-    this move: frames, or within `Every(k, ...)` every k-th frame. A chain of overlapping components
+    None omits a condition. `patience` is the number of times in a row that they must overlap before
+    they are merged, so that two objects that pass each other are not joined. It counts runs of this
+    move: frames, or every k-th frame within `Every(k, ...)`. A chain of overlapping components
     becomes one component, which keeps the lowest label.
 
-    Raises `ValueError` where both conditions are None, for a threshold that is not positive, or for
-    a patience below 1. Exact: a relabelling only.
+    Raises `ValueError` if both conditions are None, for a threshold that is not positive, or for a
+    patience below 1. Exact: only labels change.
     """
 
     max_deviations: Positive | None = eqx.field(static=True, default=1.0)
@@ -49,7 +50,7 @@ class Merge(AbstractRegrouping, ByFeatures):
             raise ValueError("max_deviations, max_distance: at least one must be given")
 
     def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
-        """How many times in a row each pair of components has overlapped, where patience counts."""
+        """How many times in a row each pair of components has overlapped, if patience counts."""
         if self.patience == 1:
             return {}
         return {"overlap_durations": jnp.zeros((num_components, num_components), jnp.int32)}
@@ -102,20 +103,19 @@ def lowest_connected(adjacent: Bool[Array, "m m"]) -> Int[Array, " m"]:
 
 
 class Prune(AbstractMove):
-    """Empty the components whose mass is below a share of the heaviest component's.
+    """Empty the components whose weight is below a share of the heaviest component's weight.
 
-    Mixture weights are posterior odds (Vermaak et al. 2003, eq. 4). Resampling gives every living
-    component some slots, however small its odds; a pruned component leaves its slots to the others.
-    With M components, a step loses at most the share (M - 1) `least_share` of the mass, and Ẑ falls
-    by at most as much.
+    Mixture weights are posterior odds (Vermaak et al. 2003, eq. 4). Resampling assigns every active
+    component some slots, however small its odds; a pruned component releases its slots to the
+    others. With M components, a step loses at most the share (M - 1) `least_share` of the weight,
+    and Ẑ decreases by at most as much.
 
-    - `group`: a function that gives each particle the whole number of its group, the same within a
-      component, as that of `Resample` does. A component is then compared with the heaviest of
-      its group: hypotheses about one object of several, whose odds their masses are. None compares
-      all.
+    - `group`: a function that returns the number of each particle's group, the same within a
+      component, as for `Resample`. A component is then compared with the heaviest of its group:
+      hypotheses about one of several objects, whose odds are their weights. None compares all.
 
     Raises `ValueError` for a share outside (0, 1). Use it after a propagation, before regrouping,
-    where hypotheses that turned out wrong hold particles that others need.
+    if hypotheses that have become improbable occupy particles that others need.
     """
 
     least_share: InnerShare = eqx.field(static=True, default=1e-6)

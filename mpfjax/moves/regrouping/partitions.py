@@ -1,4 +1,4 @@
-"""Groups of another kind than clouds: all particles in one, random sets, and the user's labels."""
+"""Groupings that are not clusters: all particles in one group, random sets, and given labels."""
 
 from collections.abc import Callable
 
@@ -16,10 +16,10 @@ from mpfjax.operations.stored import take
 
 
 class Pool(AbstractRegrouping):
-    """Put all particles into component 0, so that the mixture is one particle set.
+    """Move all particles to component 0, so that the mixture is one particle set.
 
     The left-hand side of eq. 3 of Smith and Gatica-Perez (2004), read from right to left. Use it
-    before a `Resample` in which the components should compete. Exact: a relabelling only.
+    before a `Resample` in which the components should compete. Exact: only labels change.
     """
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
@@ -28,14 +28,14 @@ class Pool(AbstractRegrouping):
 
 
 class RandomPartition(AbstractRegrouping):
-    """Deal the particles at random into sets of equal size, without replacement.
+    """Divide the particles at random into sets of equal size, without replacement.
 
     Smith and Gatica-Perez (2004), section 4: C sets of N/C particles each; sizes differ by one if C
-    does not divide N. Empty slots are dealt after the filled ones. The mass of a set is that of
-    its particles (eq. 5), so the distribution does not change.
+    does not divide N. Empty slots are assigned after the occupied ones. The weight of a set is the
+    sum of its particles' weights (eq. 5), so the distribution does not change.
 
-    C is the number of components. Use it where all components should stand for the same
-    distribution, as when `Partitioned` gives each an order of its own.
+    C is the number of components. Use it if all components should represent the same distribution,
+    as when `Partitioned` assigns a different order to each.
     """
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
@@ -56,20 +56,20 @@ class RandomPartition(AbstractRegrouping):
 
 
 class GroupBy(AbstractRegrouping):
-    """Group the particles by a label that they have: a regime, a room, a hypothesis.
+    """Group the particles by a label that is part of their state: a regime, a room, a hypothesis.
 
     A particle with label m is in component m. The labels do not change the weights, so the
-    distribution stays the same (Vermaak et al. 2003, section 4). With `Resample`, each label keeps
-    particles even while it is improbable. For regimes this is the IMM particle filter (Blom and
-    Bloem 2007).
+    distribution does not change (Vermaak et al. 2003, section 4). With `Resample`, each label
+    retains particles even while it is improbable. For regimes this is the IMM particle filter (Blom
+    and Bloem 2007).
 
-    - `group`: gives the label of each particle, (n,): whole numbers in [0, M), where M is the
-      filter's `num_components`, or True and False for 1 and 0. A function of the particles, as
-      `lambda states: states["room"]`.
+    - `group`: a function of the particles that returns their labels, (n,), such as `lambda states:
+      states["room"]`: integers in [0, M), where M is the filter's `num_components`, or True and
+      False for 1 and 0.
 
-    A label outside [0, M) of a filled slot is a RuntimeError that names the move. Raises
+    A label outside [0, M) of an occupied slot is a RuntimeError that names the move. Raises
     `ValueError` for anything but a function, and for one that does not return such labels. Use it
-    where you know what the modes are, and `KMeans`, `Merge` and `Split` where you do not.
+    if the modes are known, and `KMeans`, `Merge` and `Split` if they are not.
     """
 
     group: Callable[[PyTree], Int[Array, " n"] | Bool[Array, " n"]] = eqx.field(static=True)
@@ -84,7 +84,7 @@ class GroupBy(AbstractRegrouping):
         return mixture.replace(component_indicators=indicators)
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
-        """The label of every particle; that of an empty slot is moved into [0, M)."""
+        """The label of every particle; labels of empty slots are moved into [0, M)."""
         with saying("group of GroupBy", "called with the particles"):
             labels = self.group(mixture.particles)
         n, dtype = mixture.num_particles, getattr(labels, "dtype", float)

@@ -27,24 +27,25 @@ _ITERATIONS = 3
 
 
 class Split(AbstractRegrouping, ByFeatures):
-    """Split a component in two where it has become too diffuse.
+    """Split a component in two if it has become too diffuse.
 
     Vermaak et al. (2003), section 4, leaves the criterion open. Here weighted 2-means, started from
-    the two ends of the component, finds two halves. The component splits if all of these hold:
+    the two ends of the component, determines two halves. The component is split if all of these
+    hold:
 
     - the halves' means are more than `min_deviations` pooled standard deviations apart. The halves
       of a Gaussian are 2.6 apart and those of a uniform distribution 3.5, so 4 splits neither;
     - they are more than `min_distance` apart, in units of `scale`;
-    - the lighter half holds at least `min_share` of the component's mass.
+    - the lighter half has at least `min_share` of the component's weight.
 
-    The centres of the halves are found from a sample: every k-th particle, about `sample_size`
-    times M of them; None takes all. After resampling, copies are neighbours, so that the sample
+    The centres of the halves are computed from a sample: every k-th particle, about `sample_size`
+    times M of them; None uses all. After resampling, copies are neighbours, so that the sample
     includes every group of copies with a share of at least one in `sample_size`. All particles are
     then used to assign them to halves and to test the conditions.
 
-    The lighter half takes a free label. If there are too few free labels, the clearest splits come
-    first. Raises `ValueError` for a threshold that is negative or a share not in [0, 0.5]. Exact: a
-    relabelling only.
+    The lighter half receives a free label. If there are too few free labels, the clearest splits
+    come first. Raises `ValueError` for a threshold that is negative or a share not in [0, 0.5].
+    Exact: only labels change.
     """
 
     min_deviations: NotNegative = eqx.field(static=True, default=4.0)
@@ -53,7 +54,7 @@ class Split(AbstractRegrouping, ByFeatures):
     sample_size: Count | None = eqx.field(static=True, default=32, kw_only=True)
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
-        """The lighter half of every component that is too diffuse, to a free label."""
+        """The new indicators: the lighter half of each diffuse component receives a free label."""
         # Computed outside the condition, where XLA shares them with neighbouring moves.
         features, active = self.features_of(mixture), mixture.active
         parent = mixture.component_indicators
@@ -67,9 +68,9 @@ class Split(AbstractRegrouping, ByFeatures):
         return cond_if_any(jnp.any(~active), split, lambda: parent), mixture.memory
 
     def is_diffuse(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
-        """Which components would split if each had a free label.
+        """Which components would be split if each had a free label.
 
-        Where `StepInfo.labels_ran_out`, these are the ones in which several modes share a label.
+        If `StepInfo.labels_ran_out`, several modes share the label of each of these.
         """
         mixture = without_gradient(mixture)
         return self._halves(mixture, self.features_of(mixture))[-1]

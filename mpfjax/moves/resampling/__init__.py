@@ -1,1 +1,1 @@
-"""Resampling within components: particles in line, ancestors by scheme, allocation of slots."""
+"""Resampling within components: order of particles, ancestors by scheme, allocation of slots."""

@@ -1,4 +1,4 @@
-"""Allocation: how many slots each component gets in a resampling, and which."""
+"""Allocation: how many slots each component receives in a resampling, and which."""
 
 from typing import NamedTuple
 

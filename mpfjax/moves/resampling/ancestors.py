@@ -1,15 +1,16 @@
-"""Drawing ancestors: the particle that each slot takes, by one of several schemes.
+"""Sampling of ancestors: the parent of each slot, by one of several schemes.
 
 A scheme returns the first slot of every particle's offspring. Each particle has an interval of the
 line, as long as its expected number of offspring k_m w_i, and the scheme places one point in the
 unit interval of each slot and counts those before the particle's. To add a scheme, write such a
 function and name it in `SCHEMES`.
 
-A particle may be kept, as conditional SMC does: it then has one offspring at least. The offspring
-of all have their ordinary law, given that one slot of its component, each with equal probability,
-has the kept particle for its parent. So the numbers of offspring have their ordinary law weighed by
-that of the kept particle, and its slot is any of its offspring. Points get this law if one of them
-is drawn uniformly from the particle's own interval.
+A particle may be retained, as in conditional SMC: it then has at least one offspring. The offspring
+of all have their ordinary distribution, given that one slot of its component, each with equal
+probability, has the retained particle as its parent. So the numbers of offspring have their
+ordinary distribution weighted by the number of the retained particle, and its slot is any of its
+offspring. Points have this distribution if one of them is drawn uniformly from the particle's own
+interval.
 """
 
 from collections.abc import Callable

@@ -26,22 +26,22 @@ class AuxiliaryResample(AbstractWrapper):
     """Resample in proportion to w_i ν(y_t, x_{t-1}^i), and divide the weights by ν again.
 
     The first stage of the auxiliary particle filter (Pitt and Shephard 1999). The look-ahead ν
-    predicts how well each particle will explain y_t. Particles with a larger ν have more offspring,
-    before anything is drawn at t. The distribution stays the same in expectation for any ν:
-    offspring of a particle with k times the offspring have 1 / k of the weight. Ẑ stays unbiased.
-    Unlike that of `Resample`, the mass of a component changes. Everything happens within
+    predicts how well each particle will explain y_t, and particles with a larger ν have more
+    offspring before anything is drawn at t. The distribution is unchanged in expectation for any ν:
+    a particle with k times as many offspring has offspring with 1 / k of the weight. Ẑ remains
+    unbiased. Unlike in `Resample`, the weight of a component changes. All resampling is within
     components.
 
     - `resample`: the `Resample` that draws; its `ess_threshold` applies to the weights times ν.
     - `lookahead`: a function (y_t, states) -> log ν of each particle, (n,); a proposal that has
-      `log_normaliser`, such as `GaussNewtonProposal`; or what has `log_factors(mixture, now)`, as a
-      learned one. The best ν is p(y_t | x_{t-1}). It must be positive for every particle that can
-      explain y_t, and its tails no thinner than those of p(y_t | x_{t-1}): an overconfident ν
-      leaves most of the weight to a few particles. Where ν is zero for all particles of a
-      component, the component is resampled by w alone.
+      `log_normaliser`, such as `GaussNewtonProposal`; or an object that has `log_factors(mixture,
+      now)`, such as a learned look-ahead. The best ν is p(y_t | x_{t-1}). It must be positive for
+      every particle that can explain y_t, and its tails no lighter than those of p(y_t | x_{t-1}):
+      an overconfident ν leaves most of the weight to a few particles. If ν is zero for all
+      particles of a component, the component is resampled by w alone.
 
     Without an observation nothing is resampled. Raises `ValueError` for a look-ahead that is
-    neither function nor such a proposal. Use it, with a proposal of the same kind, where the
+    neither a function nor such a proposal. Use it, with a proposal of the same kind, if the
     likelihood is narrow.
     """
 
@@ -55,7 +55,7 @@ class AuxiliaryResample(AbstractWrapper):
     """but what a component weighs is only the same in expectation."""
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
-        """Raise a `ValueError` for a model that the look-ahead cannot work with."""
+        """Raise a `ValueError` for a model that the look-ahead does not support."""
         super().check(now, num_particles, num_components)
         if hasattr(self.lookahead, "check"):
             self.lookahead.check(now)

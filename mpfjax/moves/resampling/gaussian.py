@@ -23,24 +23,24 @@ from mpfjax.operations.segments import spread
 
 
 class GaussianRegeneration(AbstractResampling):
-    """Replace each component's particles by draws from N(μ_m, Σ_m), its own mean and covariance.
+    """Replace each component's particles by draws from N(μ_m, Σ_m), with its own moments.
 
     μ_m = Σ w_i x_i and Σ_m = Σ w_i (x_i - μ_m)(x_i - μ_m)ᵀ, over the particles of component m (Lin
     et al. 2012, eqs. 10 and 11; Kotecha and Djuric 2003 for one component). The component keeps its
-    mass, which its new particles share equally. It is an approximation unless the component is
-    Gaussian (`approximate` is true): any shape other than an ellipse is lost. Use it where
-    components are unimodal and resampling would leave too few distinct particles.
+    weight, which its new particles share equally. It is an approximation unless the component is
+    Gaussian (`approximate` is true): any shape other than an ellipse is lost. Use it if components
+    are unimodal and resampling would leave too few distinct particles.
 
     - `particles_per_component`: as for `Resample`.
     - `where`: selects the part of the state that is redrawn, such as `lambda state: state.box`. The
-      rest (angles, bounded or whole numbers) is copied from resampled particles. None redraws the
-      whole state.
-    - `noise`: "independent"; or "stratified" or "rqmc", which spread the draws of all slots, or of
-      each component, evenly. With "rqmc", each component's draws are then ordered along a Hilbert
-      curve, as `Propagate(noise="rqmc")` needs them.
+      rest (angles, bounded numbers or integers) is copied from resampled particles. None redraws
+      the whole state.
+    - `noise`: "independent"; or "stratified" or "rqmc", which distribute the draws of all slots, or
+      of each component, evenly. With "rqmc", each component's draws are then ordered along a
+      Hilbert curve, as `Propagate(noise="rqmc")` requires.
 
     With a singular Σ_m, draws stay in its plane; a component of one particle, or of copies of one,
-    gives that particle again. A draw has no single ancestor. Raises `ValueError` for an unknown
+    reproduces that particle. A draw has no single ancestor. Raises `ValueError` for an unknown
     noise or particles_per_component < 1.
     """
 
@@ -55,8 +55,7 @@ class GaussianRegeneration(AbstractResampling):
 
     @property
     def biases_score(self) -> bool:
-        """Whether a part of the state is copied, which derivatives do not see; draws are made of
-        moments, which they do."""
+        """Whether a part of the state is copied, which derivatives ignore; draws are functions of moments, which are differentiated."""
         return self.where is not None
 
     keeps_parents = False
@@ -69,7 +68,7 @@ class GaussianRegeneration(AbstractResampling):
         self._resample.check(now, num_particles, num_components)
 
     def resample(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """The mixture with every living component redrawn."""
+        """The mixture with every active component redrawn."""
         key_noise, key_rest = split(key, 2)
         vacated = self._resample.resample(key_rest, mixture)
         drawn = self._draw(key_noise, self._redrawn(mixture.particles), mixture, vacated)

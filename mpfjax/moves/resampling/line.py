@@ -1,10 +1,10 @@
-"""The particles in line for resampling, component by component.
+"""The order of the particles for resampling, component by component.
 
-Imagine the particles on a line, each with an interval as long as its expected number of offspring.
-Every slot has a point on the line and takes the particle whose interval holds it. The particles of
-a component must be neighbours. After resampling they are, and until they are regrouped nothing has
-to be sorted. Within a component they stand in any order, or sorted: by a number, or along a Hilbert
-curve.
+The particles are arranged on a line, each with an interval as long as its expected number of
+offspring. Every slot has a point on the line, and its parent is the particle whose interval
+contains the point. The particles of a component must be neighbours. After resampling they are, and
+until they are regrouped nothing has to be sorted. Within a component their order is arbitrary, or
+sorted: by a number, or along a Hilbert curve.
 """
 
 from collections.abc import Callable

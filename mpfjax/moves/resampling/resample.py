@@ -28,47 +28,49 @@ Allocation = Literal["variance", "equal"]
 
 
 class Resample(AbstractResampling):
-    """Draw each component's particles anew in proportion to their weights w_i.
+    """Redraw each component's particles in proportion to their weights w_i.
 
-    Components are resampled independently of each other, which keeps the support of every mode
-    (Vermaak et al. 2003, section 3). A component keeps its mass, and its new particles share it
+    Components are resampled independently of each other, which preserves the support of every mode
+    (Vermaak et al. 2003, section 3). A component keeps its weight, and its new particles share it
     equally. The expected number of offspring of particle i is k_m w_i for every scheme, so the
-    marginal likelihood stays unbiased.
+    marginal likelihood remains unbiased.
 
     - `scheme`: "systematic" (the default: least noise, least work), "stratified", or "multinomial"
-      (the textbook's, most noise).
-    - `ess_threshold`: a component is resampled if its effective sample size is below this share of
-      its particles. 1.0 resamples at every step. Under `vmap`, a lower one saves no time.
-    - `particles_per_component`: None shares all slots among the living components that are
-      resampled, as `allocation` says. A number k gives each living component k particles and
-      leaves the other slots empty, as section 5.2 of the paper does.
-    - `allocation`: how the components share the slots, if neither `particles_per_component` nor
-      `group` says it. "variance" leaves Ẑ the least variance (Neyman 1934): component m has
-      a share in proportion to the root of π_m² k_m / ESS_m. A quarter to a half of the slots is
-      shared equally, so that every mode stays alive (see docs/masses.md). "equal" is the paper's:
-      it keeps modes of little mass longest, and log Ẑ is less exact.
-    - `group`: a function that gives each particle the whole number of its group, the same within
-      a component. Groups with a component that is resampled share the slots equally, and so do the
-      components within a group. None makes no groups. Use it where components are rival hypotheses
-      about several objects, so that an object with many does not take the slots of the others.
-    - `sort_by`: a function that gives each particle a number, (n,), or several, (n, d). Within
-      their component the particles are resampled in the order of these numbers. Several numbers
-      are standardised within the component, and the order is that along a Hilbert curve through
-      them, or of more than 8 through their first principal components. "hilbert" takes all
-      floating point numbers of the state; a function that picks those on which later observations
-      depend orders better. Systematic and
-      stratified resampling in a good order change the distribution least (Kitagawa 1996). With
-      the "rqmc" noise of `Propagate`, it is array randomised quasi-Monte Carlo (L'Ecuyer, Lécot
-      and Tuffin 2008; Gerber and Chopin 2015). Use it where masses or likelihoods must be accurate.
-    - `gradient`: what a derivative of the filter sees of the resampling.
-        - "none": nothing. The drawn indices are constants, and the derivative of the log marginal
-          likelihood is NOT an estimate of the score: its bias stays however many particles there
-          are, and it may have the wrong sign.
+      (the textbook scheme, most noise).
+    - `ess_threshold`: a component is resampled if its effective sample size is below this fraction
+      of its number of particles. 1.0 resamples at every step. Under `vmap`, a lower value saves no
+      time.
+    - `particles_per_component`: None divides all slots among the active components that are
+      resampled, according to `allocation`. A number k assigns k particles to each active component
+      and leaves the other slots empty, as in section 5.2 of the paper.
+    - `allocation`: how the components share the slots, unless `particles_per_component` or `group`
+      determines it. "variance" minimises the variance of Ẑ (Neyman 1934): the share of component m
+      is in proportion to the root of π_m² k_m / ESS_m. A quarter to a half of the slots is divided
+      equally, so that every mode is retained (see docs/masses.md). "equal" is the paper's: it
+      retains improbable modes longest, and log Ẑ is less accurate.
+    - `group`: a function that returns the number of each particle's group, the same within a
+      component. Groups with a component that is resampled share the slots equally, and so do the
+      components within a group. None makes no groups. Use it if components are rival hypotheses
+      about several objects, so that an object with many hypotheses does not take the slots of the
+      others.
+    - `sort_by`: a function that returns a number for each particle, (n,), or several, (n, d).
+      Within their component the particles are resampled in the order of these numbers. Several
+      numbers are standardised within the component, and the order is along a Hilbert curve through
+      them, or, if there are more than 8, through their first principal components. "hilbert" uses
+      all floating-point components of the state; a function that selects those on which later
+      observations depend yields a better order. Systematic and stratified resampling in a good
+      order change the distribution least (Kitagawa 1996). With the "rqmc" noise of `Propagate`, the
+      filter is array randomised quasi-Monte Carlo (L'Ecuyer, Lécot and Tuffin 2008; Gerber and
+      Chopin 2015). Use it if mixture weights or likelihoods must be accurate.
+    - `gradient`: how a derivative of the filter treats the resampling.
+        - "none": it is ignored. The drawn indices are constants, and the derivative of the log marginal
+          likelihood is NOT an estimate of the score: its bias does not decrease with the number of
+          particles, and it may have the wrong sign.
         - "stop": the new weights are w_a / ⊥w_a times the old share, where ⊥ is `stop_gradient`
-          (Ścibior and Wood 2021, DPF-SGR). Values are the same to the bit; derivatives of Ẑ are
+          (Ścibior and Wood 2021, DPF-SGR). Values are identical to the bit; derivatives of Ẑ are
           unbiased. For parameters of the dynamics, `Propagate` and `Partitioned` have it too.
-      The masses of the components have their derivative in both. Indicators have none, and need
-      none, since regrouping does not change the distribution.
+      The weights of the components are differentiated in both cases. Indicators have no derivative,
+      and need none, because regrouping does not change the distribution.
 
     Raises `ValueError` for an unknown scheme or gradient or allocation, a threshold outside [0, 1],
     k < 1, and k together with `group`.
@@ -92,14 +94,14 @@ class Resample(AbstractResampling):
 
     @property
     def biases_score(self) -> bool:
-        """Whether it may resample, and without a gradient."""
+        """Whether it may resample without a gradient."""
         return self.gradient == "none" and self.ess_threshold > 0
 
     keeps_families = True
     """it updates the memory of Eve indices."""
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
-        """Raise a `ValueError` for fewer slots than each component is to have."""
+        """Raise a `ValueError` for fewer slots than each component requires."""
         each = self.particles_per_component or 1
         if each * num_components > num_particles:
             raise ValueError(
@@ -108,7 +110,7 @@ class Resample(AbstractResampling):
             )
 
     def around(self, reference: Any) -> "Resample":
-        """The move itself, which finds the slot of the one that is kept in the memory."""
+        """The move itself, which finds the slot of the retained trajectory in the memory."""
         return self
 
     def due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
@@ -130,11 +132,11 @@ class Resample(AbstractResampling):
     def redraw(
         self, key: Key[Array, ""], mixture: ParticleMixture, due: Bool[Array, " m"]
     ) -> tuple[ParticleMixture, Ancestors]:
-        """Resample the components that are `due`; with `ess_threshold` 1 all living ones are.
+        """Resample the components that are `due`; with `ess_threshold` 1 all active ones are.
 
-        In conditional SMC the kept trajectory has an offspring whatever is drawn, and the ancestors
-        have their ordinary law, given that one slot of its component, each with equal probability,
-        has it for its parent. `draw_ancestors` says how.
+        In conditional SMC the retained trajectory always has an offspring, and the ancestors have
+        their ordinary distribution, given that one slot of its component, each with equal
+        probability, has it as its parent. `draw_ancestors` describes the method.
         """
         n, m = mixture.num_particles, mixture.num_components
         all_are_due = self.ess_threshold == 1.0
@@ -177,7 +179,7 @@ class Resample(AbstractResampling):
     def deal(
         self, mixture: ParticleMixture, line: Line, due: Bool[Array, " m"]
     ) -> Int[Array, " m"]:
-        """How many slots each component gets; those in line that are not `due` keep theirs."""
+        """How many slots each component receives; components that are not `due` keep theirs."""
         num_slots, demands = mixture.num_usable_slots, None
         if self.group is not None:
             demands = demands_of_groups(mixture, self.group(mixture.particles), due)

@@ -1,4 +1,4 @@
-"""The alarm: a cumulative sum of what speaks against all hypotheses (CUSUM, Page 1954)."""
+"""The alarm: a cumulative sum of the evidence against all hypotheses (CUSUM, Page 1954)."""
 
 import equinox as eqx
 import jax

@@ -1,4 +1,4 @@
-"""A state drawn anew from the last L observations: at step L of a run, or where an alarm rings."""
+"""A state that is redrawn given the last L observations: at step L of a run, or at an alarm."""
 
 import dataclasses
 from functools import partial
@@ -128,23 +128,24 @@ class RecentSteps(Memory):
 
 
 class Restart(AbstractWrapper):
-    """Draws the state anew from the last L observations, at step L or where the alarm rings.
+    """Redraws the state given the last L observations, at step L or when the alarm is raised.
 
-    `sample_window` draws N particles of p(x_t | y_{t-L+1}..y_t), of a state that began anew L steps
-    ago, with its evidence. At step L of a run, a start, they take the place of all particles.
-    Before, the filter runs as it is, and the increments are reported as zero; then their sum is
-    that of the sampler, so that Ẑ is unbiased.
+    `sample_window` draws N particles of p(x_t | y_{t-L+1}..y_t), for a state that started from the
+    prior L steps ago, with its evidence. At step L of a run, the initialisation, they replace all
+    particles. Before, the filter runs without change, and the increments are reported as zero; then
+    their sum is the estimate of the sampler, so that Ẑ is unbiased.
 
-    At a restart, their weight is p times their evidence, and the weight of the hypotheses there are
-    1 - p times theirs for the same L observations. Each gets slots in proportion to its weight, a
-    sixteenth at least. A restart happens where the alarm (`Alarm`) rings and its sum was last zero
-    at least L steps ago. So Ẑ is unbiased for a state that may begin anew where an alarm sends one
-    back, and nowhere else. A step without likelihood under all hypotheses counts p times the
-    evidence of a state that begins anew in it, until a restart knows better.
+    At a restart, the new particles are weighted by p times their evidence, the existing components
+    by 1 - p times theirs for the same L observations. Each receives slots in proportion to its
+    weight, but at least a sixteenth. A restart happens if the alarm (`Alarm`) is raised and its sum
+    was last zero at least L steps ago. So Ẑ is unbiased for a state that may restart at the steps
+    to which an alarm refers, and at no others. A step in which no hypothesis has a positive
+    likelihood contributes p times the evidence of a state that restarts in it, until a restart
+    replaces this value.
 
-    - `grouping`: moves that group the particles drawn anew; usually the initial moves.
+    - `grouping`: moves that group the new particles; usually the initial moves.
     - `num_observations`: L.
-    - `at_start`: whether step L of a run is a start.
+    - `at_start`: whether the filter is initialised at step L of a run.
     - `probability`: p; None never restarts.
     - `num_particles`: draws of x_0 of the alarm.
 

@@ -1,13 +1,13 @@
-"""x_L given y_1..y_L of a window of few steps: a tempered sampler of x_0 and of each step's noise.
+"""A tempered sampler of x_L given y_1..y_L of a short window, over x_0 and each step's noise.
 
-A particle is a whole path: x_0, or the noise that it is made of, and the noise of each step; where
-a model draws x_t by a key, a key of its own for each step, so that x_t is a function of x_0 and of
-the keys. y_t enters by powers (Del Moral, Doucet and Jasra 2006). After each, paths are resampled
-and moved by Metropolis steps (resample-move, Gilks and Berzuini 2001; Chopin 2002) for the target
-p(x_0) Π_{s<t} L(y_s | x_s) L(y_t | x_t)^power. A step proposes other noise for step t, at the cost
-of one step, or another x_0 with the same noise, at the cost of t, since the whole path follows. A
-pilot, paths with draws of their own, is moved along: it decides the powers and the steps of x_0,
-so that the evidence stays unbiased.
+A particle is a whole path: x_0, or its noise, and the noise of each step; if a model draws x_t by a
+key, a separate key for each step, so that x_t is a function of x_0 and of the keys. y_t enters by
+powers (Del Moral, Doucet and Jasra 2006). After each power, paths are resampled and moved by
+Metropolis steps (resample-move, Gilks and Berzuini 2001; Chopin 2002) for the target p(x_0) Π_{s<t}
+L(y_s | x_s) L(y_t | x_t)^power. A step proposes either new noise for step t, which requires one
+step, or another x_0 with the same noise, which requires t, because the whole path follows. A pilot
+set of independent paths is moved along: it determines the powers and the steps of x_0, so that the
+evidence remains unbiased.
 """
 
 from functools import partial
