@@ -1,1 +1,1 @@
-"""State-space models: the interface, and the models that ship with the library."""
+"""State-space models: the interface, and the models included in the library."""

@@ -23,34 +23,34 @@ from mpfjax.operations.random import normal, split
 class AbstractStateSpaceModel(eqx.Module):
     """A Markov state x_t with observations y_t; all methods act on all particles at once.
 
-    p(x_0), D(x_t | x_{t-1}) and L(y_t | x_t) of Vermaak et al. (2003), section 2. x_0 is the prior,
-    before any observation; the first observation is y_1. The states are a pytree whose leaves have
-    a leading axis n of particles. One key serves all n particles, which is several times faster
-    than a key for each. If you prefer to write the model for one particle, wrap it with
+    p(x_0), D(x_t | x_{t-1}) and L(y_t | x_t) of Vermaak et al. (2003), section 2. x_0 follows the
+    prior, before any observation; the first observation is y_1. The states are a pytree whose
+    leaves have a leading axis n of particles. One key serves all n particles, which is several
+    times faster than a key for each. To write the model for one particle instead, wrap it with
     `per_particle`.
 
-    A class may set `handles_missing = True`. It then receives observations with NaN where values
-    are missing, and its likelihood must use the values that are there.
+    A class may set `handles_missing = True`. It then receives observations with NaN for missing
+    values, and its likelihood must use the values that are present.
 
     A model may also define `log_transition(states, previous_states)`, log D of each particle, shape
-    (n,), and `log_initial(states)`, log p(x_0). Guided proposals, smoothers and scores need the
+    (n,), and `log_initial(states)`, log p(x_0). Guided proposals, smoothers and scores require the
     first, `exact.grid_filter` and particle Gibbs with a prior the second, a bootstrap filter none.
 
-    A class may set `periods`, in the form of one state: those of numbers that go round, as angles
-    do, and zero for all others. Recipes of mixtures then group particles on the circle, and means
-    of mixtures are those on it.
+    A class may set `periods`, with the structure of one state: the periods of its periodic
+    components, such as angles, and zero for all others. Mixture filters then cluster particles on
+    the circle, and means of mixtures are circular.
 
-    In place of `sample_transition`, a model may define how x_t is made of noise:
+    Instead of `sample_transition`, a model may define x_t as a function of noise:
     `transition_from_noise(noise, states)`, whose `noise` is standard normal, (n, k), and
-    `noise_dimension`, k. `sample_transition` then draws independent noise. A uniform number is
-    `jax.scipy.special.ndtr` of a normal one. `Propagate(noise="rqmc")` needs this form: its noise
-    is spread evenly over the particles. `initial_from_noise(noise)` and `initial_noise_dimension`
+    `noise_dimension`, k. `sample_transition` then draws independent noise. `jax.scipy.special.ndtr`
+    of a normal number is uniform. `Propagate(noise="rqmc")` requires this form: its noise is
+    distributed evenly over the particles. `initial_from_noise(noise)` and `initial_noise_dimension`
     do the same for x_0.
 
     A model that declares a field `inputs`, None by default, finds u_t there at each step: known
-    data beside the observation, such as a control, a covariate or the time since the last step. All
-    its methods can read `self.inputs`. A model that uses u_t in another way defines `with_inputs`
-    itself. x_0 has no input.
+    data besides the observation, such as a control, a covariate or the time since the last step.
+    All its methods can read `self.inputs`. A model that uses u_t in another way defines
+    `with_inputs` itself. x_0 has no input.
     """
 
     handles_missing = False
@@ -58,8 +58,8 @@ class AbstractStateSpaceModel(eqx.Module):
     def with_inputs(self, inputs: PyTree) -> "AbstractStateSpaceModel":
         """The model at a step whose known inputs are u_t: the field `inputs` is set.
 
-        A model may override it, to let any of its parameters change in time. It is called while JAX
-        traces a step, so it must not use the values of u_t in Python.
+        A model may override it, so that any of its parameters varies in time. It is called while
+        JAX traces a step, so it must not use the values of u_t in Python.
         """
         return replaced(self, inputs=inputs)
 
@@ -295,20 +295,20 @@ def mapped(model: Any, function: Any) -> Any:
 
 
 def per_particle(model: Any) -> AbstractStateSpaceModel:
-    """Make a batched model of one that is written for a single particle.
+    """The model for all particles from a model that is written for a single particle.
 
     `model` has `sample_initial(key)`, `sample_transition(key, state)` and
     `log_likelihood(observation, state)`, each for one particle. It may also have, for one particle,
     `log_transition(state, previous_state)`, `log_initial(state)`, `with_history(state,
-    previous_state)`, `transition_from_noise(noise, state)` with noise (k,) (also in place of
+    previous_state)`, `transition_from_noise(noise, state)` with noise (k,) (also instead of
     `sample_transition`), `sample_observation(key, state)`, `transition_mean(state)` and
     `observation_mean(state)`, and, for all particles, `noise_dimension`, `transition_covariance`,
     `observation_covariance` and `prepare_observation(observation)`. Known inputs u_t are set as its
-    `inputs` where it has an attribute of this name, or handed to its `with_inputs(inputs)`. Use it
-    for a first version of a model: with a key for each particle, draws take four to five times as
-    long as those of a batched model.
+    `inputs` if it has an attribute of this name, or passed to its `with_inputs(inputs)`. Use it for
+    a first version of a model: with a key for each particle, draws take four to five times as long
+    as for a batched model.
 
-    Raises `ValueError` where one of the three methods is missing.
+    Raises `ValueError` if one of the three methods is missing.
     """
     law = "transition_from_noise"
     law = law if hasattr(model, law) else "sample_transition"

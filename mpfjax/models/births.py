@@ -1,4 +1,4 @@
-"""Where new objects appear: how many in a step, and what they are like."""
+"""Birth models: how many new objects appear in a step, where, and with which states."""
 
 import abc
 import math
@@ -29,7 +29,7 @@ class AbstractBirth(eqx.Module):
     """The Poisson process of new objects in a step: `rate` of them, each with x ~ b.
 
     A subclass has `rate`, a positive number, `sample`, and `propose`, by which the particles of a
-    new object start at a measurement.
+    new object are drawn from a measurement.
     """
 
     rate: eqx.AbstractVar[Float[Array, ""]]
@@ -42,11 +42,11 @@ class AbstractBirth(eqx.Module):
     def propose(
         self, key: Key[Array, ""], measurement: PyTree, num_particles: int, sensor: int
     ) -> tuple[PyTree, Float[Array, " n"]]:
-        """States of new objects that a sensor's measurement may come from, and log b(x) / q(x)."""
+        """States of new objects that may have caused a measurement, and log b(x) / q(x)."""
 
 
 class Box(Fitting):
-    """Places between two corners, in any number of dimensions."""
+    """A region between two corners, in any number of dimensions."""
 
     low: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("low"))
     high: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("high"))
@@ -57,7 +57,7 @@ class Box(Fitting):
             check_spacing("high", self.high, np.subtract(self.high, self.low), "the box has")
 
     def sample(self, key: Key[Array, ""], num_places: int) -> Float[Array, "n d"]:
-        """Draw places evenly."""
+        """Draw positions uniformly."""
         shares = uniform(key, (num_places, self.low.shape[0]), self.low.dtype)
         return self.low[None] + shares * (self.high - self.low)[None]
 
@@ -68,7 +68,7 @@ class Box(Fitting):
 
 
 class Disc(Fitting):
-    """Places around a centre: a disc in two dimensions, a ball in three."""
+    """A region around a centre: a disc in two dimensions, a ball in three."""
 
     centre: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("centre"))
     radius: Annotated[Float[Array, ""], POSITIVE] = eqx.field(converter=to_array("radius"))
@@ -78,7 +78,7 @@ class Disc(Fitting):
         check_spacing("centre", self.centre, self.radius, "the radius is")
 
     def sample(self, key: Key[Array, ""], num_places: int) -> Float[Array, "n d"]:
-        """Draw places evenly."""
+        """Draw positions uniformly."""
         key_way, key_far = split(key, 2)
         d, dtype = self.centre.shape[0], self.centre.dtype
         ways = normal(key_way, (num_places, d), dtype)
@@ -94,17 +94,17 @@ class Disc(Fitting):
 
 
 class UniformBirth(AbstractBirth, Fitting):
-    """New objects evenly in a region.
+    """New objects that are uniform in a region.
 
-    - `rate`: how many to expect in a step.
-    - `region`: a `Box` or a `Disc` of places.
-    - `newborn`: a function `(key, places) -> states` of new objects at these places, (n, d); it
-      draws the rest of the state, such as a speed.
-    - `locate`: a function `(key, measurement, n) -> (places, log_density)`, which draws places
-      that a measurement may come from, and has the log of their density, (n,); one for each
-      sensor where there are several.
+    - `rate`: the expected number per step.
+    - `region`: a `Box` or a `Disc` of positions.
+    - `newborn`: a function `(key, places) -> states` of new objects at these positions, (n, d); it
+      draws the rest of the state, such as a velocity.
+    - `locate`: a function `(key, measurement, n) -> (places, log_density)`, which draws positions
+      that may have caused a measurement, with the log of their density, (n,); one function per
+      sensor if there are several.
 
-    Raises `ValueError` for a rate that is not positive. Use it where objects enter unannounced.
+    Raises `ValueError` for a rate that is not positive. Use it if objects may appear anywhere.
     """
 
     rate: Rate = eqx.field(converter=to_array("rate"))

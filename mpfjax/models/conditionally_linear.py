@@ -1,5 +1,6 @@
-"""Models that are linear and Gaussian but for a latent part of the state: a Kalman filter for each
-particle, which carries the moments of the rest in place of a draw.
+"""Models that are linear and Gaussian given a latent part of the state.
+
+Each particle carries the moments of the linear part, by a Kalman filter, instead of a draw.
 """
 
 import abc
@@ -32,17 +33,17 @@ from mpfjax.operations.random import normal
 
 
 class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
-    """A latent z_t with its own law, and x_t that is linear and Gaussian given z.
+    """A latent Markov process z_t, and x_t that is linear and Gaussian given z.
 
     z_t ~ p(. | z_{t-1}), and given z_0, ..., z_t
 
         x_0 ~ N(m0, P0),    x_t = F x_{t-1} + b + N(0, Q),    y_t = H x_t + c + N(0, R),
 
     where all of these may depend on z. The first observation is y_1. Particles are
-    `MarginalisedState`s (latent, mean, covariance): a draw of z_t, and E and Cov of x_t given
-    z_0, ..., z_t and y_1..y_t, by the Kalman filter. So x takes no particles (Doucet, de Freitas,
-    Murphy and Russell 2000; Chen and Liu 2000). The latent is a pytree whose leaves have a leading
-    axis n, as the states of any model.
+    `MarginalisedState`s (latent, mean, covariance): a draw of z_t, and E and Cov of x_t given z_0,
+    ..., z_t and y_1..y_t, by the Kalman filter. So x needs no particles (Doucet, de Freitas, Murphy
+    and Russell 2000; Chen and Liu 2000). The latent is a pytree whose leaves have a leading axis n,
+    as the states of any model.
 
     A model defines
 
@@ -51,37 +52,40 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
     - `sample_transition(key, latent)`: z_t; or `transition_from_noise(noise, latent)` and
       `noise_dimension`, as in `AbstractStateSpaceModel`;
     - `dynamics(latent, previous_latent)`: F (d, d), b (d,), Q (d, d), given z_t and z_{t-1};
-    - `emission(latent)`: H (p, d), c (p,), R (p, p), given z_t; or None if y_t says nothing of x.
+    - `emission(latent)`: H (p, d), c (p,), R (p, p), given z_t; or None if y_t does not depend on
+      x.
 
-    An array with a leading n has one for each particle; otherwise all particles share it. Q and R
-    may be singular. If no matrix has a leading n, every particle has the same covariance, which is
-    then computed once: a step takes a fraction of the time (Schön, Gustafsson and Nordlund 2005).
-    A move that gives particles covariances of their own needs F with a leading n. A diffuse x_0
-    costs digits: in float32 log Ẑ is right to 0.05 up to about P0 / R = 1e7; beyond that set
-    jax_enable_x64.
+    An array with a leading n has one entry for each particle; otherwise all particles share it. Q
+    and R may be singular. If no matrix has a leading n, every particle has the same covariance,
+    which is then computed once: a step takes a fraction of the time (Schön, Gustafsson and Nordlund
+    2005). A move that assigns different covariances to the particles requires F with a leading n. A
+    diffuse x_0 loses digits: in float32 log Ẑ is accurate to 0.05 up to about P0 / R = 1e7; beyond
+    that set jax_enable_x64.
+
     It may also define
 
-    - `log_transition(latent, previous_latent)`: log p(z_t | z_{t-1}), (n,), which proposals,
-      gradient "stop" and smoothing need;
-    - `log_likelihood(observation, latent)`: log of the density of what is seen of z alone, (n,);
-      zero unless it is defined;
-    - `linear_observation(observation)`: the y_t, (p,), that `emission` is about; the observation
-      itself unless it is defined;
-    - `all_transitions(latent)`: where z_t takes finitely many values, all that may follow: K pairs
-      of a z_t and log p(z_t | z_{t-1}), (n,). See `RegimeProposal` and `PropagateRegimes`;
-    - `latent_dynamics(previous_latent)`: in place of `sample_transition`, where z_t depends on
-      x_{t-1}: the mixed form of Schön, Gustafsson and Nordlund (2005). z_t is then (n, k), and
+    - `log_transition(latent, previous_latent)`: log p(z_t | z_{t-1}), (n,), required by proposals,
+      gradient "stop" and smoothing;
+    - `log_likelihood(observation, latent)`: log density of observations of z alone, (n,); zero by
+      default;
+    - `linear_observation(observation)`: the y_t, (p,), to which `emission` refers; by default the
+      observation itself;
+    - `all_transitions(latent)`: if z_t takes finitely many values, all possible values: K pairs of
+      a z_t and log p(z_t | z_{t-1}), (n,). See `RegimeProposal` and `PropagateRegimes`;
+    - `latent_dynamics(previous_latent)`: instead of `sample_transition`, if z_t depends on x_{t-1}:
+      the mixed form of Schön, Gustafsson and Nordlund (2005). z_t is then (n, k), and
 
         z_t = f + A x_{t-1} + v,    v ~ N(0, V),    Cov(w, v) = S,
 
       where w is the noise of x_t, whose covariance is Q. It returns f (k,), A (k, d), V (k, k), or
-      also S (d, k), for which V must be invertible. A draw of z_t then says something of x_{t-1}.
+      also S (d, k), for which V must be invertible. A draw of z_t then contains information on
+      x_{t-1}.
 
-    An entry of y_t that is NaN is missing, and `log_likelihood` must leave it out as well. A class
-    with `handles_missing = False` never gets one. `particle_filter`, `mixture_particle_filter` and
-    `auxiliary_particle_filter` take such a model like any other: their move is
-    `PropagateMarginalised`. Use it where a part of the state is linear given the rest: regimes,
-    velocities and biases beside a position, maps.
+    An entry of y_t that is NaN is missing, and `log_likelihood` must omit it as well. A class with
+    `handles_missing = False` never receives one. `particle_filter`, `mixture_particle_filter` and
+    `auxiliary_particle_filter` accept such a model like any other: their move is
+    `PropagateMarginalised`. Use it if a part of the state is linear given the rest: regimes,
+    velocities and biases in addition to a position, maps.
     """
 
     handles_missing = True
@@ -105,10 +109,10 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
 
     @abc.abstractmethod
     def emission(self, latent: PyTree) -> tuple[Array, Array, Array] | None:
-        """H, c, R of y_t = H x_t + c + N(0, R), given z_t; None where nothing is seen of x."""
+        """H, c, R of y_t = H x_t + c + N(0, R), given z_t; None if x is not observed."""
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
-        """log of the density of what is seen of z alone; zero here."""
+        """log density of observations of z alone; zero here."""
         return jnp.zeros(jax.tree.leaves(states)[0].shape[0], default_float())
 
     def linear_observation(self, observation: PyTree) -> Float[Array, " p"]:

@@ -1,4 +1,4 @@
-"""The law of a model: the one place where a model is called and its results are checked."""
+"""The law of a model: the only place where a model is called and its results are checked."""
 
 import functools
 from dataclasses import dataclass

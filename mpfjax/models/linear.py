@@ -1,4 +1,4 @@
-"""Linear-Gaussian models: one system, and K of them with a Markov chain that chooses one."""
+"""Linear Gaussian models: one system, and K systems selected by a Markov chain."""
 
 import dataclasses
 from typing import Annotated
@@ -49,14 +49,14 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
     - `A`, `Q`: (d, d); `H`: (p, d); `R`: (p, p); `m0`: (d,); `P0`: (d, d). R is positive definite;
       P0 and Q may be singular, but x_0 or x_t then has no density. States have shape (n, d),
       observations (p,).
-    - `B`: (d, k), the control matrix, for inputs u_t, (k,). None leaves B u_t out.
+    - `B`: (d, k), the control matrix, for inputs u_t, (k,). None omits B u_t.
 
-    Inputs are u_t alone, or a dict of the fields that change in time by their names, such as
-    {"A": ..., "Q": ..., "inputs": ...}: each is that field at step t. So the matrices of a
+    Inputs are u_t alone, or a dict of the fields that vary in time by their names, such as {"A":
+    ..., "Q": ..., "inputs": ...}: each contains that field at step t. So the matrices of a
     continuous-time system at irregular times are inputs too.
 
-    Raises `ValueError` for shapes that do not fit together, and for Q, R or P0 that is no
-    covariance. Use it to compare a filter with the Kalman filter, or where the system is linear.
+    Raises `ValueError` for shapes that do not agree, and for Q, R or P0 that is not a covariance.
+    Use it to compare a filter with the Kalman filter, or if the system is linear.
     """
 
     A: Annotated[Float[Array, "d d"], FINITE] = eqx.field(converter=to_array("A"))
@@ -71,13 +71,13 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
     inputs: Float[Array, " k"] | None = eqx.field(converter=to_array("inputs"), default=None)
 
     def with_inputs(self, inputs: PyTree) -> "LinearGaussianModel":
-        """The model at step t: u_t, (k,), or a dict of the fields that change in time."""
+        """The model at step t: u_t, (k,), or a dict of the fields that vary in time."""
         fields = inputs if isinstance(inputs, dict) else {"inputs": inputs}
         return dataclasses.replace(self, **fields)
 
     @property
     def control(self) -> Float[Array, " d"] | None:
-        """B u_t; None where there is no B, or no u_t."""
+        """B u_t; None if there is no B, or no u_t."""
         return None if self.B is None or self.inputs is None else self.B @ self.inputs
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
@@ -147,13 +147,13 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
 
 
 class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
-    """A Markov chain of K regimes z_t, and a linear-Gaussian system for each of them.
+    """A Markov chain of K regimes z_t, and a linear Gaussian system for each of them.
 
         P(z_t = j | z_{t-1} = i) = Π_ij,    x_0 ~ N(m0, P0),
         x_t = F[z_t] x_{t-1} + b[z_t] + N(0, Q[z_t]),    y_t = H[z_t] x_t + c[z_t] + N(0, R[z_t])
 
-    A jump Markov linear system, or switching state-space model. The latent is the regime, whole
-    numbers (n,). `exact.switching_filter` is exact for a short series.
+    A jump Markov linear system, or switching state-space model. The latent is the regime, integers
+    (n,). `exact.switching_filter` is exact for a short series.
 
     - `transition_matrix`: Π, (K, K), each row sums to one.
     - `F`, `Q`: (d, d), or (K, d, d) with one for each regime; `H`: (p, d) or (K, p, d); `R`: (p, p)
@@ -162,9 +162,9 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
     - `b`, `c`: (d,) or (K, d), and (p,) or (K, p); None is zero.
     - `initial_probabilities`: of z_0, (K,); None makes all equal.
 
-    Raises `ValueError` for shapes that do not fit together, for rows that are no probabilities, and
-    for Q, R or P0 that is no covariance.
-    Use it for manoeuvring targets, and for regimes of a time series.
+    Raises `ValueError` for shapes that do not agree, for rows that are not probabilities, and for
+    Q, R or P0 that is not a covariance. Use it for manoeuvring targets, and for regimes of a time
+    series.
     """
 
     transition_matrix: Annotated[Float[Array, "k k"], PROBABILITIES] = eqx.field(
@@ -206,7 +206,7 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
     noise_dimension = initial_noise_dimension = 1
 
     def initial_from_noise(self, noise: Float[Array, "n 1"]) -> Regimes:
-        """z_0 of standard normal numbers."""
+        """z_0 as a function of standard normal numbers."""
         return self._initial(jax.scipy.special.ndtr(noise[:, 0]))
 
     def initial_moments(self, latent: Regimes) -> tuple[Parts, Parts]:
@@ -219,7 +219,7 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
         return self._next(shares, latent)
 
     def transition_from_noise(self, noise: Float[Array, "n 1"], latent: Regimes) -> Regimes:
-        """z_t of standard normal numbers."""
+        """z_t as a function of standard normal numbers."""
         return self._next(jax.scipy.special.ndtr(noise[:, 0]), latent)
 
     def log_transition(self, latent: Regimes, previous_latent: Regimes) -> Float[Array, " n"]:
@@ -232,7 +232,7 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
         return spread(log_or_nothing(self.probabilities_at_start), latent)
 
     def all_transitions(self, latent: Regimes) -> list[tuple[Regimes, Float[Array, " n"]]]:
-        """Every regime, with log of its probability after z_{t-1}."""
+        """Every regime, with the log of its probability given z_{t-1}."""
         log_matrix = log_or_nothing(self.transition_matrix)
         return [
             (jnp.full_like(latent, j), spread(log_matrix[:, j], latent))

@@ -37,29 +37,28 @@ _TRIAL = 1_000_003
 class MultiObjectModel(AbstractStateSpaceModel, Checked):
     """x_t = (x_t^1, ..., x_t^J): J objects, each with its own dynamics and likelihood.
 
-    Smith and Gatica-Perez (2004), section 2: D is a product over the objects, and so is
-    L(y_t | x_t) = Π_j L(y_t | x_t^j). An interaction adds the factor Π_{i<j} ψ(x_t^i, x_t^j) to
-    every step, a Markov random field (Khan, Balch and Dellaert 2004). It counts as part of L, so
-    Ẑ estimates the same number with every filter. A step without an observation has neither L nor
-    ψ.
+    Smith and Gatica-Perez (2004), section 2: D is a product over the objects, and so is L(y_t |
+    x_t) = Π_j L(y_t | x_t^j). An interaction adds the factor Π_{i<j} ψ(x_t^i, x_t^j) to every step,
+    a Markov random field (Khan, Balch and Dellaert 2004). It is part of L, so that Ẑ estimates the
+    same number with every filter. A step without an observation has neither L nor ψ.
 
-    - `object_model`: one model for all objects, or one whose arrays all carry a leading object
-      axis, as `jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)` makes it.
+    - `object_model`: one model for all objects, or one whose arrays all have a leading object axis,
+      such as `jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)`.
     - `num_objects`: J.
     - `interaction`: log ψ of the states of two objects, `(states, other_states) -> (n,)`,
       symmetric; such as `PairwiseRepulsion`.
-    - `shared_observation`: with False, object j sees `observation[j]`, every leaf indexed by j.
-      With True, all objects see the whole observation, such as an image. If `object_model` then
+    - `shared_observation`: with False, object j observes `observation[j]`, every leaf indexed by j.
+      With True, all objects observe the whole observation, such as an image. If `object_model` then
       has a method `prepare_observation(observation)`, it is called once in each step, for all
-      particles and objects, and its result goes to `log_likelihood`.
+      particles and objects, and its result is passed to `log_likelihood`.
     - `shared_inputs`: with True, all objects have the same known inputs u_t. With False, object j
       has `inputs[j]`, every leaf indexed by j.
     - `per_object`: whether the arrays have an object axis. With None they have one if the model
-      cannot be drawn without, which is traced and not computed.
+      cannot be sampled without it, which is traced and not computed.
 
     Particles have leaves (n, J, ...). Raises `ValueError` for J < 1, an object model that lacks a
-    method or the object axis, and one that is conditionally linear. Use it where objects interact
-    or share particles; without interaction `independent_particle_filters` is better.
+    method or the object axis, and one that is conditionally linear. Use it if objects interact or
+    share particles; without interaction `independent_particle_filters` is better.
     """
 
     object_model: AbstractStateSpaceModel
@@ -81,11 +80,11 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
 
     @property
     def handles_missing(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether the objects' model does."""
+        """Whether the object model handles missing values."""
         return getattr(self.object_model, "handles_missing", False)
 
     def with_inputs(self, inputs: PyTree) -> "MultiObjectModel":
-        """The model whose objects have u_t, all the same or each its own."""
+        """The model whose objects have the inputs u_t, all the same or one each."""
         model, per_object = self.object_model, self.per_object
         if self.shared_inputs and not per_object:
             model = with_inputs(model, inputs)
@@ -173,7 +172,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
     # own for each, (n,); `states` are those of that object, leaves (n, ...).
 
     def object_at(self, index: int | Int[Array, "*n"]) -> Any:
-        """The model of one object, or of all where they share it."""
+        """The model of one object, or of all if they share it."""
         if not self.per_object:
             return self.object_model
         return jax.tree.map(
@@ -193,7 +192,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
     def replace_object(
         self, particles: PyTree, objects: Int[Array, "*n"], states: PyTree
     ) -> PyTree:
-        """The particles with one object of each in a new state."""
+        """The particles in which one object has these states."""
         num_particles = jax.tree.leaves(particles)[0].shape[0]
         objects = jnp.broadcast_to(objects, (num_particles,))
         chosen = objects[:, None] == self._indices[None]
@@ -212,7 +211,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
         return _one_by_one(draw, objects, states, split(key, objects.shape[0]))
 
     def prepare_observation(self, observation: PyTree) -> PyTree:
-        """What the objects' likelihoods look at: y_t, or what the object model makes of it."""
+        """The argument of the objects' likelihoods: y_t, or the object model's function of it."""
         if not self.shared_observation:
             check_one_each(self.num_objects, "objects", observation=observation)
             return observation
@@ -244,7 +243,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
     def object_with_history(
         self, states: PyTree, previous_states: PyTree, objects: Int[Array, "*n"]
     ) -> PyTree:
-        """The states of one object of each particle, with the past of these previous ones."""
+        """The states of one object of each particle, with the past of these previous states."""
         if not hasattr(self.object_model, "with_history"):
             return states
         return self._asked("with_history", objects, states, previous_states)
@@ -267,17 +266,17 @@ class PairwiseRepulsion(Fitting):
     """log ψ(x_i, x_j) = -strength · k(|p_i - p_j| / radius), p the positions of two objects.
 
     The pairwise Markov random field of Khan, Balch and Dellaert (2004), for objects that cannot
-    share a place, with k(r) = (1 - r²)² for r < 1 and 0 beyond. ψ is symmetric, exactly 1 where the
-    objects are further apart than the radius, so that a filter can tell that they do not touch, and
-    smooth: it has a gradient everywhere, even where the objects are at the same point.
+    share a position, with k(r) = (1 - r²)² for r < 1 and 0 beyond. ψ is symmetric, exactly 1 if the
+    objects are further apart than the radius, so that a filter can detect that they do not touch,
+    and smooth: it has a gradient everywhere, even if the objects are at the same point.
 
     - `strength`: -log ψ of two objects at the same point, in nats; positive.
     - `radius`: in the unit of the positions; positive.
-    - `features`: maps the states of one object, leading axis n, to (n, k) or (n,); None takes
-      the whole state.
+    - `features`: maps the states of one object, leading axis n, to (n, k) or (n,); None uses the
+      whole state.
 
-    Called with the states of two objects, it gives (n,). Raises `ValueError` for a strength or
-    radius that is not positive. Use it where look-alikes cross and must not be tracked as one.
+    Called with the states of two objects, it returns (n,). Raises `ValueError` for a strength or
+    radius that is not positive. Use it if similar objects cross and must not be tracked as one.
     """
 
     strength: Annotated[Float[Array, ""], POSITIVE] = eqx.field(converter=to_array("strength"))

@@ -1,4 +1,4 @@
-"""Standard normal and uniform draws: independent, or spread evenly over particles."""
+"""Standard normal and uniform draws: independent, or distributed evenly over particles."""
 
 from typing import Literal
 

@@ -16,11 +16,11 @@ from mpfjax.models.law import law_of
 
 
 class Series(eqx.Module):
-    """All that a filter is given at the steps 1, ..., t; every leaf has a leading axis t.
+    """The data of a filter at the steps 1, ..., t; every leaf has a leading axis t.
 
     Every function of observations accepts either the arrays of y_1, ..., y_t, all of them finite
-    numbers, or a `Series`, which also has the known inputs and says which observations are missing.
-    In `run_filter`, `monte_carlo` and `run_islands`, `inputs=` and `missing=` are short for it.
+    numbers, or a `Series`, which also contains the known inputs and marks missing observations. In
+    `run_filter`, `monte_carlo` and `run_islands`, `inputs=` and `missing=` are short for it.
     """
 
     observations: PyTree
@@ -35,10 +35,11 @@ class Series(eqx.Module):
 
     @classmethod
     def skipping(cls, observations: PyTree, inputs: PyTree = None) -> "Series":
-        """Observations of which those that hold a NaN or an infinity are missing.
+        """Observations in which those with a NaN or an infinity are missing.
 
-        A model with `handles_missing = True` gets both; for it, only a step of nothing but NaN is
-        missing. For others a RuntimeWarning counts the steps of which some numbers were there.
+        A model with `handles_missing = True` receives both; for it, only a step with nothing but
+        NaN is missing. For other models a RuntimeWarning counts the steps of which some numbers
+        were present.
         """
         return cls(observations, inputs, skips_missing=True)
 

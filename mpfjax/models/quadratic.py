@@ -25,7 +25,7 @@ class QuadraticModel(AbstractStateSpaceModel, Fitting):
     """A random walk whose square is observed: D = N(x_{t-1}, σ_x²), L = N(y_t; x_t², σ_y²).
 
     Vermaak et al. (2003), section 5.1. The observation does not depend on the sign of x_t. With a
-    symmetric prior, the filtering distribution thus has two modes of exactly equal mass, at about ±
+    symmetric prior, the posterior therefore has two modes of exactly equal probability, at about ±
     sqrt(y_t).
 
     - `sigma_x`, `sigma_y`: standard deviations, positive.
@@ -34,7 +34,7 @@ class QuadraticModel(AbstractStateSpaceModel, Fitting):
       gaps, and with small n they may miss a mode before the first observation.
 
     States have shape (n,), observations are scalars. Raises `ValueError` for a deviation that is
-    not positive, an empty range or an unknown draw. Use it to see which filters keep both modes.
+    not positive, an empty range or an unknown draw. Use it to test which filters retain both modes.
     """
 
     sigma_x: Deviation = eqx.field(converter=to_array("sigma_x"), default=0.1)

@@ -55,7 +55,10 @@ class GaussianRegeneration(AbstractResampling):
 
     @property
     def biases_score(self) -> bool:
-        """Whether a part of the state is copied, which derivatives ignore; draws are functions of moments, which are differentiated."""
+        """Whether a part of the state is copied, which derivatives ignore.
+
+        The draws themselves are functions of moments, which are differentiated.
+        """
         return self.where is not None
 
     keeps_parents = False

@@ -63,9 +63,9 @@ class Resample(AbstractResampling):
       filter is array randomised quasi-Monte Carlo (L'Ecuyer, Lécot and Tuffin 2008; Gerber and
       Chopin 2015). Use it if mixture weights or likelihoods must be accurate.
     - `gradient`: how a derivative of the filter treats the resampling.
-        - "none": it is ignored. The drawn indices are constants, and the derivative of the log marginal
-          likelihood is NOT an estimate of the score: its bias does not decrease with the number of
-          particles, and it may have the wrong sign.
+        - "none": it is ignored. The drawn indices are constants, and the derivative of the log
+          marginal likelihood is NOT an estimate of the score: its bias does not decrease with the
+          number of particles, and it may have the wrong sign.
         - "stop": the new weights are w_a / ⊥w_a times the old share, where ⊥ is `stop_gradient`
           (Ścibior and Wood 2021, DPF-SGR). Values are identical to the bit; derivatives of Ẑ are
           unbiased. For parameters of the dynamics, `Propagate` and `Partitioned` have it too.
