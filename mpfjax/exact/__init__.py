@@ -1,6 +1,4 @@
-"""Exact references: a grid filter for scalar models, Kalman's filter and smoother for linear ones,
-and all sequences of regimes for switching ones.
-"""
+"""Exact references: grid filter, Kalman filter and smoother, and enumeration of regimes."""
 
 from mpfjax.exact.grid import grid_filter as grid_filter
 from mpfjax.exact.kalman import kalman_filter as kalman_filter

@@ -40,7 +40,7 @@ class GridFilterRun(eqx.Module):
         return jnp.sum(self.probabilities * (self.grid[None] - self.means[:, None]) ** 2, axis=1)
 
     def mass_above(self, threshold: float) -> Float[Array, " t"]:
-        """P(x_t > threshold | y_1..y_t); of the cell at the threshold, the part above it counts."""
+        """P(x_t > threshold | y_1..y_t); the cell that contains the threshold counts in part."""
         cell = _width(self.grid)
         return self.probabilities @ jnp.clip((self.grid - threshold) / cell + 0.5, 0.0, 1.0)
 
@@ -56,14 +56,15 @@ def grid_filter(
 
     - `model`: has `log_initial`, `log_transition` and `log_likelihood`; its states are scalars of
       shape `state_shape`, () or (1,).
-    - `grid`: evenly spaced points that cover all values that x_t can have, with several points in
-      the smallest standard deviation of the model. The error then falls faster than any power of
+    - `grid`: evenly spaced points that cover all possible values of x_t, with several points per
+      smallest standard deviation of the model. The error then decreases faster than any power of
       the spacing.
     - `observations`: arrays, or a `Series`.
 
-    Costs O(t g²). Differentiable in the model's parameters. Raises `ValueError` for a grid that is
-    not one row of evenly spaced, ascending numbers, a conditionally linear model or one without
-    these densities, and for data as `run_filter` does. Use it as the reference for a scalar model.
+    The computing time is O(t g²). Differentiable in the model's parameters. Raises `ValueError` for
+    a grid that is not one row of evenly spaced, ascending numbers, a conditionally linear model or
+    one without these densities, and for data as `run_filter` does. Use it as the reference for a
+    scalar model.
     """
     points, width = _checked_grid(grid)
     for density in ("log_initial", "log_transition", "log_likelihood"):

@@ -1,4 +1,4 @@
-"""The Kalman filter and smoother, for linear-Gaussian models."""
+"""The Kalman filter and smoother, for linear Gaussian models."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ StepOf = Callable[[PyTree], LinearStep]
 
 
 class KalmanFilterRun(eqx.Module):
-    """The filtering distribution of a linear-Gaussian model."""
+    """The filtering distribution of a linear Gaussian model."""
 
     means: Float[Array, "t d"]
     """E[x_t | y_1..y_t]."""
@@ -49,7 +49,7 @@ class KalmanFilterRun(eqx.Module):
 
 
 class KalmanSmootherRun(eqx.Module):
-    """The smoothing distribution of a linear-Gaussian model; its first time is that of x_0."""
+    """The smoothing distribution of a linear Gaussian model; its first time is the time of x_0."""
 
     means: Float[Array, "t d"]
     """E[x_s | y_1..y_t] for s = 0, ..., t."""
@@ -64,18 +64,18 @@ class KalmanSmootherRun(eqx.Module):
 def kalman_filter(model: LinearGaussianModel, observations: PyTree) -> KalmanFilterRun:
     """The Kalman filter (Kalman 1960), with the library's convention: y_1 follows x_1, not x_0.
 
-    Covariances are factors U diag(D) Uᵀ, and no variance is a difference: in float32 log Z is right
-    to 0.05 up to a diffuse prior of P_0 / R = 1e13. Differentiable, and `jax.vmap` maps it over
-    several series.
+    Covariances are factors U diag(D) Uᵀ, and no variance is a difference: in float32 log Z is
+    accurate to 0.05 up to a diffuse prior of P_0 / R = 1e13. Differentiable, and `jax.vmap` maps it
+    over several series.
 
     - `observations`: an array (t, p), or a `Series` of one, whose inputs are those of the model:
-      controls, or matrices that change in time. `Series.skipping` leaves out each number that is
-      NaN: of two sensors, the one that is there counts. (A particle filter leaves out the whole
-      step, unless its model has `handles_missing`.) Otherwise a NaN is a `ValueError`, as far as
-      the numbers are known.
+      controls, or matrices that vary in time. `Series.skipping` omits each number that is NaN: of
+      two sensors, the one that is present is used. (A particle filter omits the whole step, unless
+      its model has `handles_missing`.) Otherwise a NaN is a `ValueError`, as far as the numbers are
+      known.
 
     Raises `ValueError` for another model and observations that are not (t, p). Use it as the
-    reference for a linear-Gaussian model.
+    reference for a linear Gaussian model.
     """
     filtered, increments = _kalman_filter(model, *_checked(model, observations))
     return KalmanFilterRun(*filtered, increments, jnp.sum(increments))
@@ -85,13 +85,13 @@ def kalman_filter(model: LinearGaussianModel, observations: PyTree) -> KalmanFil
 def kalman_smoother(model: LinearGaussianModel, observations: PyTree) -> KalmanSmootherRun:
     """E and Cov of x_0, ..., x_t given y_1..y_t, by the recursion of Rauch, Tung and Striebel 1965.
 
-    After the Kalman filter it goes back from x_t. With (m, P) the filter's moments at s, and (m',
-    P') the smoothed ones at s + 1,
+    After the Kalman filter it proceeds backward from x_t. With (m, P) the filter's moments at s,
+    and (m', P') the smoothed ones at s + 1,
 
         G = P Aᵀ (A P Aᵀ + Q)⁻¹,   mean m + G (m' - A m),   covariance C + G P' Gᵀ,
 
     where C is Cov[x_s | x_{s+1}, y_1..y_s]. Precision, derivatives, arguments and errors are those
-    of `kalman_filter`. Use it as the reference for particle smoothers of a linear-Gaussian model.
+    of `kalman_filter`. Use it as the reference for particle smoothers of a linear Gaussian model.
     """
     return _smooth(model, *_checked(model, observations))
 

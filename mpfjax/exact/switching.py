@@ -46,13 +46,13 @@ _MOST_SEQUENCES = 2**20
 def switching_filter(
     model: SwitchingLinearGaussianModel, observations: PyTree
 ) -> SwitchingFilterRun:
-    """All K^(t+1) sequences of regimes z_0, ..., z_t, and a Kalman smoother for each.
+    """All K^(t+1) sequences of regimes z_0, ..., z_t, with a Kalman smoother for each.
 
-    The answer is exact. No recursion gives it, since
-    the number of Gaussians grows K-fold with every step. `observations` are an array (t, p), or a
-    `Series` of one, of which `Series.skipping` leaves out each number that is NaN. Differentiable.
-    Raises `ValueError` for another model, for observations that are not
-    (t, p), and for more than a million sequences. Use it as the reference for a short series.
+    The result is exact. No recursion exists, because the number of Gaussians grows K-fold with
+    every step. `observations` are an array (t, p), or a `Series` of one, of which `Series.skipping`
+    omits each number that is NaN. Differentiable. Raises `ValueError` for another model, for
+    observations that are not (t, p), and for more than a million sequences. Use it as the reference
+    for a short series.
     """
     series = gathered(observations)
     rows = checked_rows(series, model.H.shape[-2], model.m0.dtype)

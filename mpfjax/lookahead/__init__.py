@@ -1,1 +1,1 @@
-"""Look-aheads: what later observations say of a particle, before it is resampled or moved."""
+"""Look-aheads: the information of later observations on a particle, before it is resampled."""

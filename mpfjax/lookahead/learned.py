@@ -39,47 +39,46 @@ def learn_lookahead(
     *,
     features: Callable[[PyTree], Array] | None = None,
 ) -> Filter:
-    """Learn a filter that looks ahead to all later observations, when it resamples and when it
-    draws.
+    """Learn a filter whose resampling and proposal look ahead to all later observations.
 
     A twisted particle filter (Whiteley and Lee 2014), whose twisting functions are learned by
     iteration (Guarniero, Johansen and Lee 2017; Heng, Bishop, Deligiannidis and Doucet 2020). A
-    pass runs the filter with what was learned so far. Then it goes back in time: with
+    pass runs the filter with the functions learned so far. Then it proceeds backward in time: with
     x_t = f(x_{t-1}, ε), ψ_T first and ν_{T+1} = 1, it fits
 
         log ψ_t(x_{t-1}, ε) ≈ log L(y_t | x_t) + log ν_{t+1}(x_t)
 
-    by least squares to particles x_{t-1} of the pass and fresh noise ε, and has in closed form
-    ν_t(x) = ∫ N(ε; 0, I) ψ_t(x, ε) dε ≈ p(y_t, ..., y_T | x), by which x_{t-1} is resampled, and
-    q_t(ε | x) ∝ N(ε; 0, I) ψ_t(x, ε), by which x_t is drawn. log ψ_t is a quadratic in φ(x) and ε
-    for each mode, found by the filter's components; a constant and a share of undisturbed noise
-    keep its tails heavy (`LocalQuadratics`). x_0 is twisted as well where the model makes it of
-    noise.
+    by least squares to particles x_{t-1} of the pass and new noise ε, and has in closed form ν_t(x)
+    = ∫ N(ε; 0, I) ψ_t(x, ε) dε ≈ p(y_t, ..., y_T | x), by which x_{t-1} is resampled, and q_t(ε |
+    x) ∝ N(ε; 0, I) ψ_t(x, ε), by which x_t is drawn. log ψ_t is a quadratic in φ(x) and ε for each
+    mode, as represented by the filter's components; a constant and a share of unmodified noise keep
+    its tails heavy (`LocalQuadratics`). x_0 is twisted as well if the model computes it from noise.
 
-    The returned filter is exact. Other keys led to ψ, so Ẑ is unbiased given ψ, and the weights are
-    those of the filtering distribution. If log ψ is nearly quadratic, log Ẑ and the masses at the
-    end vary far less. If too few particles taught ψ, they vary no less than before. Before the end,
-    the particles are where all observations lead, so means of x_t given y_1..y_t are less exact
-    than those of `filter`. The filter is good for these observations alone; for another series of
-    the same length it is exact, but no better. With other parameters of the model it is exact too,
-    and good as long as the posterior of the states is similar. `eqx.tree_at` changes its `model`,
-    and so do the samplers of `mpfjax.tuning`. No `SelectInitial` chooses x_0, since ψ does.
+    The returned filter is exact. ψ was learned with other keys, so Ẑ is unbiased given ψ, and the
+    weights represent the filtering distribution. If log ψ is nearly quadratic, log Ẑ and the final
+    mixture weights vary far less. If ψ was learned from too few particles, they vary no less than
+    before. Before the final time, the particles are where all observations lead, so filtering means
+    of x_t are less accurate than those of `filter`. The filter is efficient for these observations
+    only; for another series of the same length it is exact, but no more efficient. With other
+    parameters of the model it is exact too, and efficient as long as the posterior of the states is
+    similar. `eqx.tree_at` changes its `model`, and so do the samplers of `mpfjax.tuning`. No
+    `SelectInitial` selects x_0, because ψ does.
 
     - `filter`: of moves `Resample` (or `AuxiliaryResample`, whose look-ahead is replaced),
-      `Propagate` and regrouping; its components get equal slots. Its model makes x_t of noise,
-      `transition_from_noise`. Take one with components where there are modes.
-    - `num_passes`: how often the filter runs to learn, with sixteen times its particles, since
-      errors of ψ stay. Each pass is kept whole while ψ is fitted.
+      `Propagate` and regrouping; its components have equal allocation. Its model computes x_t from
+      noise, `transition_from_noise`. Use one with components if there are several modes.
+    - `num_passes`: how often the filter runs to learn, with sixteen times its particles, because
+      errors of ψ persist. The whole pass is stored while ψ is fitted.
     - `features`: φ, in which log ψ is nearly quadratic, (states) -> (n, d); of one particle, if the
       model is wrapped by `per_particle`. None is the flattened state.
-    - `observations`: arrays, or a `Series`; steps without an observation are looked over.
+    - `observations`: arrays, or a `Series`; steps without an observation are skipped.
 
     For a conditionally linear model ε is the noise of z_t, L the density of y_t given z_0, ..., z_t
-    and y_1..y_{t-1}, and φ that of the particles: by default of the latent and the mean.
+    and y_1..y_{t-1}, and φ a function of the particles: by default of the latent and the mean.
 
-    Raises `ValueError` for another filter, and for a model that makes x_t otherwise. Use it if all
-    observations are known from the start: for log Ẑ in `metropolis_hastings` and `smc2`, to compare
-    models, and for the masses of modes at the end.
+    Raises `ValueError` for another filter, and for a model without `transition_from_noise`. Use it
+    if all observations are known in advance: for log Ẑ in `metropolis_hastings` and `smc2`, to
+    compare models, and for the final weights of modes.
     """
     model = filter.model
     if not is_mixed(model):

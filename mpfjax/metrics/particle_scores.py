@@ -26,13 +26,13 @@ def crps(
     """The continuous ranked probability score of weighted draws, in the unit of the values.
 
     CRPS = ∫ (F(z) - 1{z >= y})² dz = E|Y - y| - E|Y - Y'| / 2 of the distribution F of the draws
-    (Gneiting and Raftery 2007, section 4.2), by a sum over the draws in order, O(n log n). It is
-    the absolute error where all weight is in one draw. A weight of zero leaves a draw out, and
-    weights need not sum to one. A NaN in a row makes its score NaN.
+    (Gneiting and Raftery 2007, section 4.2), by a sum over the sorted draws, O(n log n). It is the
+    absolute error if all weight is on one draw. Draws of weight zero are ignored, and weights need
+    not sum to one. A NaN in a row makes its score NaN.
 
     Use it to score the observations of `mpfjax.forecast`, with the weights of the forecast's
     mixtures. Raises `ValueError` for anything but arrays of real numbers, for shapes that do not
-    fit, and for a weight below zero.
+    agree, and for a negative weight.
     """
     values = real_array("... n", "values", values)
     *batch, n = map(str, values.shape)
@@ -54,13 +54,12 @@ def log_score(
     """-log p(y) under a forecast, -log Σ_i exp(ℓ_i) L(y | x_i), in nats.
 
     The logarithmic score (Gneiting and Raftery 2007, section 4.1). `mixture` is one of a
-    `Forecast`; `jax.vmap` maps over several, beside their observations. One step ahead it is the
-    negative increment of log Ẑ that the bootstrap filter's next step would give. It is +inf where
-    no particle has any likelihood.
+    `Forecast`; `jax.vmap` maps over several, together with their observations. One step ahead it is
+    the negative increment of log Ẑ in the next step of the bootstrap filter. It is +inf if the
+    likelihood of every particle is zero.
 
-    Use it to compare models that see the same observations, with likelihoods that are normalised.
-    Raises `ValueError` for anything but a model and a mixture, and for a likelihood of another
-    shape.
+    Use it to compare models of the same observations, with likelihoods that are normalised. Raises
+    `ValueError` for anything but a model and a mixture, and for a likelihood of another shape.
     """
     observation = one_observation(observation)
     values = law_of(model).log_likelihood(observation, mixture.particles)

@@ -26,8 +26,9 @@ class OSPA(NamedTuple):
     """The result of `ospa`: distance^exponent = localisation + cardinality, a mean per object.
 
     - `distance`: the metric itself, in the unit of the positions.
-    - `localisation`: the sum of min(d, cutoff)^exponent over the pairs, by the larger number n.
-    - `cardinality`: cutoff^exponent times the share of these n that have no partner.
+    - `localisation`: the sum of min(d, cutoff)^exponent over the pairs, divided by the larger
+      number n.
+    - `cardinality`: cutoff^exponent times the fraction of these n that have no partner.
     """
 
     distance: float
@@ -61,14 +62,14 @@ def ospa(
 ) -> OSPA:
     """The optimal sub-pattern assignment distance, with its parts: localisation and cardinality.
 
-    Schuhmacher, Vo and Vo (2008): for m <= n entries in the two sets, the least over
-    pairings of ((sum_i min(d_i, c)^p + c^p (n - m)) / n)^(1/p), with c the `cutoff` in the unit
-    of the positions and p the `exponent`. It is 0 for two empty sets and c where one is empty.
-    A NaN makes the distance NaN where the other set is not empty. By NumPy and SciPy, in float64.
+    Schuhmacher, Vo and Vo (2008): for m <= n entries in the two sets, the minimum over pairings of
+    ((sum_i min(d_i, c)^p + c^p (n - m)) / n)^(1/p), with c the `cutoff` in the unit of the
+    positions and p the `exponent`. It is 0 for two empty sets and c if one is empty. A NaN makes
+    the distance NaN if the other set is not empty. By NumPy and SciPy, in float64.
 
-    Raises `ValueError` for sets that are no arrays, a cutoff that is not positive and finite, and
-    an exponent below 1 or infinite. Use it for an error per object;
-    `gospa` says how many objects were missed.
+    Raises `ValueError` for sets that are not arrays, a cutoff that is not positive and finite, and
+    an exponent below 1 or infinite. Use it for an error per object; `gospa` reports how many
+    objects were missed.
     """
     shares, found, there = _paired(estimates, truths, cutoff, exponent)
     size, num_alone = max(found, there, 1), abs(found - there)
@@ -89,15 +90,15 @@ def gospa(
 ) -> GOSPA:
     """The generalised OSPA distance, with its parts: localisation, misses and false estimates.
 
-    Rahmathullah, García-Fernández and Svensson (2017), eq. 1 with alpha 2, at which each miss and
-    each false estimate costs the same: for m <= n entries in the two sets, the least over pairings
-    of (sum_i min(d_i, c)^p + (c^p / 2) (n - m))^(1/p), with c the `cutoff` in the unit of the
-    positions and p the `exponent`. The parts are those of their Proposition 1: two entries paired
-    at the cutoff or beyond are one miss and one false estimate, at c^p / 2 each. Two empty sets are
-    at distance 0. Numbers and NaN are as in `ospa`.
+    Rahmathullah, García-Fernández and Svensson (2017), eq. 1 with alpha 2, for which each miss and
+    each false estimate has the same cost: for m <= n entries in the two sets, the minimum over
+    pairings of (sum_i min(d_i, c)^p + (c^p / 2) (n - m))^(1/p), with c the `cutoff` in the unit of
+    the positions and p the `exponent`. The parts are those of their Proposition 1: two entries
+    paired at the cutoff or beyond are one miss and one false estimate, at c^p / 2 each. Two empty
+    sets are at distance 0. Numbers and NaN are treated as in `ospa`.
 
-    Raises `ValueError` as `ospa` does. Use it to score trackers that may lose objects or invent
-    them.
+    Raises `ValueError` as `ospa` does. Use it to score trackers that may lose objects or report
+    false ones.
     """
     shares, found, there = _paired(estimates, truths, cutoff, exponent)
     near, num_far = shares[~(shares >= 1)], np.sum(shares >= 1)
@@ -157,10 +158,10 @@ def track_switches(
     *,
     cutoff: Positive,
 ) -> int:
-    """How often a true object is followed by a track of another label than before.
+    """The number of times that an object is followed by a track with another label than before.
 
-    In each step estimates and true objects are paired at the least total distance, nearer than the
-    `cutoff`. Rows with a NaN are none. A track that is lost and found again under a new label
+    In each step estimates and true objects are paired at the least total distance, below the
+    `cutoff`. Rows with a NaN are ignored. A track that is lost and recovered under a new label
     counts, too; a step without a pair does not. Raises `ValueError` for a cutoff that is not
     positive and finite.
     """

@@ -1,4 +1,4 @@
-"""The scores that trackers are compared by: HOTA, MOTA and IDF1, counted by TrackEval."""
+"""The scores by which trackers are compared: HOTA, MOTA and IDF1, computed by TrackEval."""
 
 import numpy as np
 from jaxtyping import Float
@@ -30,14 +30,14 @@ def multi_object_scores(
 ) -> dict[str, float]:
     """Score tracks against the true boxes as TrackEval does, by the overlap of boxes (IoU).
 
-    Both are rows (frame, id, x, y, w, h) as MOTChallenge files have them, (x, y) the top-left
-    corner, in pixels. `frames` is the first and the last frame to score; rows outside are left
-    out. Without it every frame in which either has a box counts. `ignored` and `min_height` are
-    those of `remove_ignored`, which is called first; `read_truth` of
-    `mpfjax.vision` reads all three. The scores:
+    Both are rows (frame, id, x, y, w, h) as in MOTChallenge files, (x, y) the top-left corner, in
+    pixels. `frames` is the first and the last frame to score; rows outside are ignored. Without it
+    every frame in which either has a box counts. `ignored` and `min_height` are the arguments of
+    `remove_ignored`, which is called first; `read_truth` of `mpfjax.vision` reads all three. The
+    scores:
 
-    - "HOTA", "DetA" and "AssA", Luiten et al. (2021), each the mean over IoU thresholds of 0.05
-      to 0.95;
+    - "HOTA", "DetA" and "AssA", Luiten et al. (2021), each the mean over IoU thresholds of 0.05 to
+      0.95;
     - "MOTA", "MOTP" (the mean IoU of the matches), "id_switches", "false_positives" and "misses",
       Bernardin and Stiefelhagen (2008), at an IoU of 0.5;
     - "IDF1", Ristani et al. (2016), at an IoU of 0.5.
@@ -80,22 +80,22 @@ def remove_ignored(
     ignored: Float[np.ndarray, "i 6"],
     min_height: NotNegative = 0.0,
 ) -> Float[np.ndarray, "k 6"]:
-    """The tracked boxes that count, as MOTChallenge and KITTI choose them before they score.
+    """The tracked boxes that count, selected as by MOTChallenge and KITTI before scoring.
 
-    In each frame, tracked boxes are matched with all labelled boxes, one to one, at the largest sum
+    In each frame, tracked boxes are matched one-to-one with all labelled boxes, at the largest sum
     of overlaps (IoU) of at least a half. Then these tracked boxes are removed:
 
     - those matched to an ignored object;
-    - of those that are matched to nothing, a box of which more than half lies in one ignored
-      region, and, with a positive `min_height`, a box whose height in pixels is at most this.
+    - unmatched boxes of which more than half is in one ignored region, and, with a positive
+      `min_height`, unmatched boxes whose height in pixels is at most this.
 
     `tracks` and `truth` are rows (frame, id, x, y, w, h), and `ignored` rows (frame, kind, x, y, w,
-    h). Kind 1 is an ignored object, such as a rider where pedestrians are tracked; kind 2 a region
+    h). Kind 1 is an ignored object, such as a rider if pedestrians are tracked; kind 2 a region
     without labels; kind 3 an object that is not scored: a tracked box may match it, and is not
     removed.
 
-    Raises `ValueError` for rows that are not six finite numbers, for another kind, and for a height
-    below zero. Use it before scores of another library; `multi_object_scores` calls it.
+    Raises `ValueError` for rows that are not six finite numbers, for another kind, and for a
+    negative height. Use it before scores of another library; `multi_object_scores` calls it.
     """
     tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
     ignored = _rows(ignored, "ignored")

@@ -1,4 +1,4 @@
-"""Measurements that arrive late: the steps since are taken again, with their own keys."""
+"""Delayed measurements: the steps since then are repeated, with their own keys."""
 
 from typing import Any, NamedTuple
 
@@ -28,17 +28,17 @@ class History(NamedTuple):
 
 
 class Replay(Checked):
-    """Steps of a filter that can be taken again where a measurement arrives late.
+    """Steps of a filter that can be repeated when a delayed measurement arrives.
 
-    A late y_s belongs before all that was observed since. The mixture before step s is kept with
-    the keys and observations of the steps from s on, and they are taken again with y_s in its
-    place. So the result is, to the bit, that of a filter which had y_s in time. It costs as much as
-    the steps since.
+    A delayed y_s precedes all that was observed since. The mixture before step s is stored with the
+    keys and observations of the steps from s on, and they are repeated with y_s in its place. So
+    the result is, to the bit, that of a filter that received y_s in time. It takes as long as the
+    steps since then.
 
-    - `lag`: L, how many steps are kept, each with its mixture.
+    - `lag`: L, how many steps are stored, each with its mixture.
 
-    A choice of x_0 by y_1 is not made again. Raises `ValueError` for L < 1. Use it online, where
-    sensors have delays: a camera's frame that took longer than the odometry after it.
+    A selection of x_0 by y_1 is not repeated. Raises `ValueError` for L < 1. Use it online, if
+    sensors have delays: a camera frame that took longer than the odometry after it.
     """
 
     filter: Filter
@@ -46,7 +46,7 @@ class Replay(Checked):
 
     @checked
     def init(self, mixture: ParticleMixture) -> History:
-        """The history that starts at this mixture, of `filter.init` or of any later step."""
+        """The history that starts at this mixture, from `filter.init` or from any later step."""
         return History(mixture)
 
     @checked
@@ -58,7 +58,7 @@ class Replay(Checked):
         *,
         inputs: PyTree = None,
     ) -> tuple[History, StepInfo]:
-        """The history after y_t, None where it is missing or not there yet, and the report."""
+        """The history after y_t, None if it is missing or has not arrived yet, and the report."""
         past = PastStep(key, history.mixture, observation, inputs)
         mixture, info = self._taken(past)
         return History(mixture, (*history.steps, past)[-self.lag :]), info
@@ -67,11 +67,11 @@ class Replay(Checked):
     def late(
         self, history: History, observation: PyTree, steps_ago: CountOrZero
     ) -> tuple[History, list[StepInfo]]:
-        """The history with y_{t - steps_ago} in its place, and the reports of the steps from there.
+        """The history with y_{t - steps_ago} in its place, and the reports of the later steps.
 
-        `observation` is all that was observed in that step, in place of what was known of it: where
-        one of two sensors is late, both (a model with `handles_missing` then takes the step without
-        it as NaN). Raises `ValueError` for a step that is not kept.
+        `observation` contains everything observed in that step, and replaces what was known of it:
+        if one of two sensors is late, both (a model with `handles_missing` then receives NaN in the
+        step without it). Raises `ValueError` for a step that is no longer stored.
         """
         if steps_ago >= len(history.steps):
             raise ValueError(f"steps_ago: {steps_ago}, and {len(history.steps)} steps are kept")

@@ -1,4 +1,4 @@
-"""Long runs: one loop with a file to go on from, a bar, and an end at Ctrl-C or what is broken."""
+"""Long runs: a loop with a checkpoint file and a progress bar, which ends at Ctrl-C or an error."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -24,15 +24,15 @@ from mpfjax.running.storage import (
 
 
 class Checkpoint(Checked):
-    """The file from which a long run goes on: `fit`, `maximise`, and the samplers of parameters.
+    """The file from which a long run continues: `fit`, `maximise`, and the samplers of parameters.
 
-    - `path`: a .npz file, without pickles. If it exists, the same call goes on from it, with the
-      result of a run without interruption, to the bit. It may ask for more steps or observations.
+    - `path`: a .npz file, without pickles. If it exists, the same call continues from it, with the
+      result of an uninterrupted run, to the bit. The call may ask for more steps or observations.
     - `every`: after how many steps it is written. It is also written when the run ends, fails or is
-      interrupted. If the writing itself is interrupted, the old file stays.
-    - `name`: what the run is called, such as "adam, cosine". Its file is then recognised by this
-      name and by the data and numbers of the call, and no longer by the program that JAX makes of
-      the functions, such as a prior or an optimiser, which another version of JAX may change.
+      interrupted. If the writing itself is interrupted, the old file remains.
+    - `name`: a name of the run, such as "adam, cosine". Its file is then recognised by this name
+      and by the data and numbers of the call, and no longer by the program that JAX makes of the
+      functions, such as a prior or an optimiser, which another version of JAX may change.
 
     Raises `ValueError` for an `every` below one.
     """

@@ -1,6 +1,6 @@
-"""Checkpoints, the files that they stand in, and descriptions by which two states are compared.
+"""Checkpoints, their files, and descriptions by which two states are compared.
 
-A file is written whole or not at all, and loads without running code.
+A file is written completely or not at all, and loads without running code.
 """
 
 import dataclasses
@@ -22,14 +22,14 @@ _DESCRIPTION = "description"
 
 
 def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
-    """Write a mixture, or any pytree. An online filter can go on from it, bit for bit the same.
+    """Write a mixture, or any pytree, from which an online filter can continue, bit for bit.
 
     - `state`: arrays, typed keys and numbers in any pytree, such as `{"mixture": mixture, "t": t}`
-      or a `Filter`. Of other things, such as a network's activation, only the name is written.
-    - `path`: a .npz file without pickles. If writing is interrupted, the old file stays.
+      or a `Filter`. Of other objects, such as a network's activation, only the name is written.
+    - `path`: a .npz file without pickles. If writing is interrupted, the old file remains.
 
-    Raises `OSError` if the file cannot be written, for example on a full disk; the old file is then
-    still there. Call it every thousand steps, for example, of a filter that runs for a long time:
+    Raises `OSError` if the file cannot be written, for example on a full disk; the old file then
+    remains. Call it every thousand steps, for example, of a filter that runs for a long time:
 
         state = {"mixture": filter.init(key), "t": 0}
         if path.exists():
@@ -46,13 +46,13 @@ def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
 def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
     """The state that `save_checkpoint` wrote, equal to it to the bit.
 
-    - `like`: a state of the same structure, shapes, dtypes and static fields, whatever its
-      values: `filter.init(key)`, or `jax.eval_shape(filter.init, key)`. Everything that is not an
-      array, a key or a number is taken from it.
+    - `like`: a state of the same structure, shapes, dtypes and static fields, with any values:
+      `filter.init(key)`, or `jax.eval_shape(filter.init, key)`. Everything that is not an array, a
+      key or a number is copied from it.
 
-    Arrays come back on the default device. Raises `FileNotFoundError`. Raises `ValueError` for a
-    file that is cut off, damaged, no checkpoint, or does not hold what it says, and for the
-    checkpoint of another state, naming what differs.
+    Arrays are loaded to the default device. Raises `FileNotFoundError`. Raises `ValueError` for a
+    file that is truncated, damaged, not a checkpoint, or inconsistent, and for the checkpoint of
+    another state, naming the difference.
     """
     (arrays, saved), own = read_described(path), describe(like)
     if saved != own:

@@ -1,4 +1,4 @@
-"""Smoothing given all observations, and forecasts given those so far."""
+"""Smoothing given all observations, and forecasts given the observations so far."""
 
 from mpfjax.lookahead.learned import learn_lookahead as learn_lookahead
 from mpfjax.smoothing.conditional import conditional_filter as conditional_filter

@@ -1,7 +1,7 @@
-"""The backward kernel: the distribution of the particle at s from which one at s + 1 has come.
+"""The backward kernel: the distribution of the ancestor at s of a particle at s + 1.
 
 The index of x_s given x_{s+1} has the probabilities W_s^i D(x_{s+1} | x_s^i), where W_s are the
-joint weights of the mixture at s. Component indicators do not enter, since the weights are joint.
+joint weights of the mixture at s. Component indicators do not enter, because the weights are joint.
 """
 
 from collections.abc import Callable

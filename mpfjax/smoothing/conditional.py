@@ -1,4 +1,4 @@
-"""Conditional SMC: a filter run with one trajectory kept, and a new trajectory from it."""
+"""Conditional SMC: a filter that retains one trajectory, and a new trajectory drawn from it."""
 
 from typing import Any
 
@@ -28,10 +28,10 @@ class ConditionalRun(eqx.Module):
     """The result of a conditional filter.
 
     - `trajectory`: the new one, leaves (t + 1, ...).
-    - `run`: the run with all its mixtures, with the kept trajectory among their particles. Its
-      marginal likelihood is NOT unbiased, since one particle was not drawn.
-    - `slots`: (t + 1,), the slot of the kept trajectory in the mixture of each time.
-    - `possible`: (t + 1,), whether the model gives the kept trajectory a density above zero.
+    - `run`: the run with all its mixtures, with the retained trajectory among their particles. Its
+      marginal likelihood is NOT unbiased, because one particle was not drawn.
+    - `slots`: (t + 1,), the slot of the retained trajectory in the mixture of each time.
+    - `possible`: (t + 1,), whether the retained trajectory has a positive density.
     """
 
     trajectory: PyTree
@@ -49,42 +49,42 @@ def conditional_filter(
     *,
     backward: bool = True,
 ) -> ConditionalRun:
-    """Run a filter around a trajectory that is kept, and draw a new one from all its particles.
+    """Run a filter conditionally on a trajectory, and draw a new one from all its particles.
 
     Conditional SMC (Andrieu, Doucet and Holenstein 2010) with backward sampling (Whiteley 2010;
-    Lindsten, Jordan and Schön 2014, section 5). It leaves p(x_0, ..., x_t | y_1..y_t) as it is,
-    for every N of at least 2: if `trajectory` is a draw from it, so is the new one. So a chain of
+    Lindsten, Jordan and Schön 2014, section 5). It leaves p(x_0, ..., x_t | y_1..y_t) invariant for
+    every N of at least 2: if `trajectory` is a draw from it, so is the new one. So a chain of
     calls, each with the trajectory of the last, is an MCMC sampler of whole trajectories.
 
-    Why this holds for mixtures. Let Q be the law of all that an ordinary run draws: particles,
-    ancestors, indicators. A run and one of its trajectories (slots b_0, ..., b_t), with density
-    Ẑ W_t^{b_t} Q / Z, have p(x_0, ..., x_t | y) as the law of the states at these slots. For a
-    particle that is resampled within component m, with k_m slots, the weight π_m / k_m of the
-    offspring times the probability w_i of the ancestor i is W_i / k_m. So the weights cancel all
-    along the trajectory, and what is left is: b_0 is any of N slots, b_s any of the k_m slots of
-    the component that the trajectory was in, and all else is drawn by Q. Regrouping is part of Q
-    and no more. Indicators are functions of the particles (of all of them, the kept one among
-    them) and of numbers drawn apart, so that given the particles their law is the same whichever
-    slot is the kept one, and cancels. K-means, merging and splitting move the trajectory from one
-    component to another as they do any particle. Both backward sampling and the genealogy then
-    draw from the run alone, without regard to which of its trajectories was kept.
+    Why this holds for mixtures. Let Q be the distribution of all random variables of an ordinary
+    run: particles, ancestors, indicators. A run and one of its trajectories (slots b_0, ..., b_t),
+    with density Ẑ W_t^{b_t} Q / Z, have p(x_0, ..., x_t | y) as the distribution of the states at
+    these slots. For a particle that is resampled within component m, with k_m slots, the weight π_m
+    / k_m of the offspring times the probability w_i of the ancestor i is W_i / k_m. So the weights
+    cancel along the trajectory, and it remains that b_0 is any of N slots, b_s any of the k_m slots
+    of the trajectory's component, and all else is drawn from Q. Regrouping is part of Q. Indicators
+    are functions of the particles (of all of them, including the retained one) and of independent
+    random numbers, so that given the particles their distribution is the same for any retained
+    slot, and cancels. K-means, merging and splitting move the trajectory from one component to
+    another like any particle. Both backward sampling and the genealogy then draw from the run
+    alone, regardless of which of its trajectories was retained.
 
-    - `trajectory`: x_0, ..., x_t, leaves (t + 1, ...), as one of `sample_trajectories`.
-    - `backward`: draw the new trajectory by backward sampling, which needs the model's
-      `log_transition`. Without it, by the genealogy: it then differs from the old one only
+    - `trajectory`: x_0, ..., x_t, leaves (t + 1, ...), such as one of `sample_trajectories`.
+    - `backward`: draw the new trajectory by backward sampling, which requires the model's
+      `log_transition`. Otherwise it is drawn from the genealogy, and differs from the old one only
       in the last steps, unless N is large.
     - `observations`: arrays, or a `Series`.
 
-    x_0 is drawn one particle at a time, also where the model would draw it in strata, and no
-    `SelectInitial` chooses it. The model's `sample_transition` must draw particles independently of
+    x_0 is drawn independently for each particle, even if the model would draw it in strata, and no
+    `SelectInitial` selects it. The model's `sample_transition` must draw particles independently of
     each other.
 
-    Raises `ValueError` for a filter that is no chain of regrouping moves, `Resample`,
+    Raises `ValueError` for a filter that is not a chain of regrouping moves, `Resample`,
     `AuxiliaryResample`, `Propagate`, `Predict`, `Reweight` and `Every` of these; a conditionally
     linear model; a proposal without `log_density`; noise that is not independent; a model without
     `log_transition`, unless `backward` is false; a trajectory of other shapes or types than the
-    model's states, or of density zero (RuntimeError within jit). Use it in a Gibbs sampler of your
-    own; `mpfjax.tuning.particle_gibbs` is one for parameters.
+    model's states, or of density zero (RuntimeError within jit). Use it in your own Gibbs sampler;
+    `mpfjax.tuning.particle_gibbs` is one for parameters.
     """
     check_conditional(filter, backward, "conditional_filter")
     series = as_series(observations, filter.model)

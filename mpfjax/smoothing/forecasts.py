@@ -1,4 +1,4 @@
-"""Forecasts: the mixture some steps ahead, with its components, and observations drawn from it."""
+"""Forecasts: the mixture several steps ahead, with its components, and simulated observations."""
 
 from typing import Any
 
@@ -19,11 +19,12 @@ class Forecast(eqx.Module):
 
     - `mixtures`: the mixtures at t + 1, ..., t + k, stacked: components keep their labels as far as
       the filter's regrouping allows. `jax.vmap` maps derived quantities over them.
-    - `observations`: one simulated observation for each particle, leaves (k, n, ...), which counts
-      by the weight of its particle; None of a model without `sample_observation`.
+    - `observations`: one simulated observation for each particle, leaves (k, n, ...), weighted by
+      its particle; None for a model without `sample_observation`.
 
-    The draws are weighted, so take intervals by `ParticleMixture.quantile` and not `jnp.quantile`:
-    `jax.vmap(lambda mixture, y: mixture.quantile(y, [0.05, 0.95]))(mixtures, observations)`.
+    The draws are weighted, so compute intervals by `ParticleMixture.quantile` and not
+    `jnp.quantile`: `jax.vmap(lambda mixture, y: mixture.quantile(y, [0.05, 0.95]))(mixtures,
+    observations)`.
     """
 
     mixtures: ParticleMixture
@@ -41,20 +42,20 @@ def forecast(
 ) -> Forecast:
     """The distribution of x_{t+1}, ..., x_{t+k} given y_1..y_t, from the mixture at t.
 
-    Every step is the filter's `predict`: the particles propagate and regroup, and keep their
-    masses, so that a component's mixture weight is the probability of its mode.
+    Every step is the filter's `predict`: the particles are propagated and regrouped, and components
+    keep their weights, so that a mixture weight is the probability of its mode.
 
-    - `inputs`: u_{t+1}, ..., u_{t+k}, the known inputs of the steps to come, as for `run_filter`.
+    - `inputs`: u_{t+1}, ..., u_{t+k}, the known inputs of the future steps, as for `run_filter`.
 
     If the model has `sample_observation(key, states)`, y is drawn given each of the states, for
-    intervals of what will be observed.
+    intervals of future observations.
 
-    Give a `key` that is used nowhere else. Do not take `jax.random.fold_in(key, 1)` of the run's
-    own key, which the run has used.
+    Use a `key` that is used nowhere else, and not `jax.random.fold_in(key, 1)` of the run's key,
+    which the run has used.
 
-    Raises `ValueError` for arguments of another kind, for moves that do not say what they do
-    without an observation, and for simulated observations that are not one a particle. Use it for
-    forecasts with intervals, and to score a filter by its forecasts.
+    Raises `ValueError` for arguments of another kind, for moves whose effect without an observation
+    is unknown, and for simulated observations that are not one per particle. Use it for forecasts
+    with intervals, and to score a filter by its forecasts.
     """
     inputs = steps_of_inputs(inputs, num_steps, filter.model, "forecast")
     return _forecast(key, filter, mixture, inputs, num_steps)

@@ -1,4 +1,4 @@
-"""What a run remembers: its mixtures from x_0 to x_t, and the ancestors of its particles."""
+"""The history of a run: its mixtures from x_0 to x_t, and the ancestors of its particles."""
 
 import equinox as eqx
 import jax
@@ -69,15 +69,15 @@ def paths_through(mixtures: ParticleMixture, indices: Int[Array, "t k"]) -> PyTr
 
 
 class Genealogy(eqx.Module):
-    """The ancestors of the particles at the end, at every time of a run.
+    """The ancestors of the final particles, at every time of a run.
 
-    - `indices`: (t, n), the slot of each particle's ancestor; at the end its own.
+    - `indices`: (t, n), the slot of each particle's ancestor; at the last time its own.
     - `trajectories`: leaves (n, t, ...), the states of the ancestors: a genealogical trajectory has
-      the weight of its particle in the final mixture. Of a conditionally linear model these are the
-      latents, since the moments of an ancestor are those of filtering.
+      the weight of its particle in the final mixture. For a conditionally linear model these are
+      the latents, because the moments of an ancestor are filtering moments.
     - `share_apart`: (m, t), the number of distinct ancestors of each component's particles, divided
-      by the number of particles: 1 where all are distinct, 1/count where one is left, and zero for
-      a dead component.
+      by the number of particles: 1 if all are distinct, 1/count if one is left, and zero for an
+      empty component.
     """
 
     indices: Int[Array, "t n"]
@@ -87,13 +87,13 @@ class Genealogy(eqx.Module):
 
 @checked
 def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
-    """Follow the ancestor indices of a run back from its end.
+    """Trace the ancestor indices of a run back from its last step.
 
     `mixtures` is a run of `run_filter(..., collect=None)`, whose first time is then x_0, or the
     mixtures that it collected, whose first time is x_1. Raises `ValueError` for anything else, and
-    where particles have no single ancestors, as after restarts (an index below 0; RuntimeError
-    within jit). Use it to see how far back the history of a mode goes. Resampling leaves few
-    ancestors at early times; `sample_trajectories` draws new ones.
+    if particles have no single ancestors, as after restarts (an index below 0; RuntimeError within
+    jit). Use it to see how far back the history of a mode reaches. Resampling leaves few ancestors
+    at early times; `sample_trajectories` draws new ones.
     """
     return _trace(with_parents(mixtures_of(mixtures), "trace_ancestors"))
 

@@ -2,13 +2,13 @@
 
 Lindsten, Bunch, Särkkä, Schön and Godsill (2016). The likelihood of y_{s+1}, ... and z_{s+1}, ...
 as a function of x_s is exp(-u Ω u / 2 + λ u), up to a factor, with u the distance of x_s from the
-mean of the trajectory's own particle: the terms of u would cancel but for rounding if x itself
-stood there, far from zero. The index of z_s given the future has the probabilities
+mean of the trajectory's own particle: in terms of x itself, far from zero, the terms would cancel
+except for rounding. The index of z_s given the future has the probabilities
 
     W_s^i p(z_{s+1} | z_s^i) p(y_{s+1} | i) ∫ N(x; m_i, P_i) exp(-u Ω u / 2 + λ u) dx,
 
-with Ω and λ of s + 1, and m_i and P_i of x_{s+1} by particle i, given y_{s+1} too. Only what an
-observation says of the x before it enters Ω, so that R may be singular.
+with Ω and λ of s + 1, and m_i and P_i of x_{s+1} by particle i, given y_{s+1} too. Only the
+information of an observation on the previous x enters Ω, so that R may be singular.
 """
 
 from typing import Any, NamedTuple

@@ -31,15 +31,14 @@ _DRAWS = 2
 
 
 class SmoothedSums(eqx.Module):
-    """Smoothed expectations of a sum over the trajectory, as of each step.
+    """Smoothed expectations of a sum over the trajectory, at each step.
 
     - `sums`: leaves (t, ...), at step s the estimate of E[Σ_{r <= s} h(x_{r-1}, x_r) | y_1..y_s].
       With a lag, the sum of the first s of `terms`.
     - `terms`: leaves (t, ...), the estimates of E[h(x_{r-1}, x_r) | y_1..y_{min(r + lag, t)}] for
       every r; None without a lag.
     - `run`: the `FilterRun`, with nothing collected.
-    - `variances`: of the values of h whose expectations `terms` are, about these; None without a
-      lag.
+    - `variances`: the variances of h, in the same form as `terms`; None without a lag.
     """
 
     sums: PyTree
@@ -64,23 +63,25 @@ def smoothed_sums(
     trajectories that end in it. Two particles J of step t - 1 are drawn by the backward kernel,
     W_{t-1}^J D(x_t^i | x_{t-1}^J), and τ_t^i is the mean of τ_{t-1}^J + h(x_{t-1}^J, x_t^i) over
     them. The estimate is Σ_i W_t^i τ_t^i. W are joint weights, so this holds for a mixture too: a
-    particle may come from another component. Times Ẑ, it is unbiased if Ẑ is. The filter's run is
-    that of `run_filter` with the same key; where a state begins anew, by restarts, it is an error.
+    particle may have an ancestor in another component. Times Ẑ, it is unbiased if Ẑ is. The
+    filter's run equals `run_filter` with the same key; a run in which a state restarts is an error.
 
-    - `function`: h. It takes x_{t-1} and x_t of n particles, leaves (n, ...), and returns values of
-      each, leaves (n, ...); of one particle if the model is wrapped by `per_particle`.
+    - `function`: h. Its arguments are x_{t-1} and x_t of n particles, leaves (n, ...), and it
+      returns values for each, leaves (n, ...); of one particle if the model is wrapped by
+      `per_particle`.
     - `lag`: L. None smooths every term by all observations so far. With a lag, term r is smoothed
-      by y_1..y_{r+L} and then kept. Memory is L + 1 times that of None. The bias does not vanish
-      with N, but the variance does not grow with t - r. A lag of t or more is one of t - 1.
-    - `method`: "exact" weighs all N particles, O(N²) a step. "mcmc" (Dau and Chopin 2023) takes
-      the ancestor and goes on by steps of independent Metropolis-Hastings, O(N), and is as exact.
+      by y_1..y_{r+L} and then final. Memory is L + 1 times as large. The bias does not vanish with
+      N, but the variance does not grow with t - r. A lag of t or more is a lag of t - 1.
+    - `method`: "exact" weights all N particles, O(N²) per step. "mcmc" (Dau and Chopin 2023) starts
+      at the ancestor and continues by steps of independent Metropolis-Hastings, O(N), and is as
+      accurate.
     - `observations`: arrays, or a `Series`.
 
-    Raises `ValueError` for a model without `log_transition`, values that are not one a particle,
-    "mcmc" where a move leaves no single ancestors, and as `run_filter` does; a RuntimeError where
-    no particle can have moved to the next. Use it for the sums that scores and EM need, and for
-    series too long to keep. `sample_trajectories` needs the mixtures of all steps, and serves every
-    function at once.
+    Raises `ValueError` for a model without `log_transition`, values that are not one per particle,
+    "mcmc" if a move leaves no single ancestors, and as `run_filter` does; a RuntimeError if no
+    particle can have moved to the next. Use it for the sums that scores and EM require, and for
+    series that are too long to store. `sample_trajectories` requires the mixtures of all steps, and
+    serves every function at once.
     """
     series = as_series(observations, filter.model)
     if lag is not None:
@@ -151,7 +152,7 @@ class Terms(NamedTuple):
 
 
 class Window(NamedTuple):
-    """All that a fixed-lag smoother goes on from."""
+    """The state of a fixed-lag smoother."""
 
     mixture: ParticleMixture
     """the filter's, at t."""
@@ -163,21 +164,21 @@ class Window(NamedTuple):
 
 
 class FixedLagSmoother(Checked):
-    """E[h(x_{r-1}, x_r) | y_1..y_t] for r = t - L, ..., t, as each observation comes in.
+    """E[h(x_{r-1}, x_r) | y_1..y_t] for r = t - L, ..., t, online.
 
-    `smoothed_sums` one step at a time (PaRIS: Olsson and Westerborn 2017), with the filter in it.
-    Memory is that of h for L + 1 mixtures, whatever t is. Shapes are fixed, so that `step` compiles
-    once and works within `jax.jit` and `jax.lax.scan`.
+    `smoothed_sums` one step at a time (PaRIS: Olsson and Westerborn 2017), together with its
+    filter. Memory is the size of h for L + 1 mixtures, for any t. Shapes are fixed, so that `step`
+    compiles once and works within `jax.jit` and `jax.lax.scan`.
 
     - `filter`: one whose model has `log_transition`.
-    - `function`: h of x_{t-1} and x_t of n particles, as for `smoothed_sums`;
-      `lambda before, now: now` estimates the states themselves, an event its probability.
-    - `lag`: L. The longer, the less is lost of what later observations say. More than the dynamics
-      remember brings nothing but noise.
-    - `method`: as for `smoothed_sums`; "mcmc" costs O(N) a step, "exact" O(N²).
+    - `function`: h of x_{t-1} and x_t of n particles, as for `smoothed_sums`; `lambda before, now:
+      now` estimates the states themselves, an indicator the probability of its event.
+    - `lag`: L. The longer, the less information of later observations is lost. A lag beyond the
+      memory of the dynamics only adds noise.
+    - `method`: as for `smoothed_sums`; "mcmc" is O(N) per step, "exact" O(N²).
 
-    Raises `ValueError` as `smoothed_sums` does. Use it for estimates that may come a little late,
-    as of a place on a map; `smoothed_sums` is for a series that is there as a whole.
+    Raises `ValueError` as `smoothed_sums` does. Use it for estimates that may be slightly delayed,
+    such as a position on a map; `smoothed_sums` is for a series that is available as a whole.
     """
 
     filter: Filter
@@ -194,7 +195,7 @@ class FixedLagSmoother(Checked):
             check_keep_parents("filter", self.filter.moves, f"{user} with method 'mcmc'")
 
     def init(self, mixture: ParticleMixture) -> Window:
-        """The window to start from: at the mixture of `Filter.init`, or at any later one."""
+        """The initial window: at the mixture of `Filter.init`, or at any later one."""
         return Window(mixture, self._no_terms(mixture.particles), jnp.zeros((), jnp.int32))
 
     @checked
@@ -208,9 +209,9 @@ class FixedLagSmoother(Checked):
     ) -> tuple[Window, PyTree, StepInfo]:
         """The next window, the estimates of r = t - L, ..., t, and the filter's report.
 
-        Estimates have leaves (L + 1, ...): the first is final, the last is the filter's own. They
-        are NaN for r < 1, where there is no term yet. `observation` is y_t, None where it is
-        missing; `inputs` are u_t.
+        Estimates have leaves (L + 1, ...): the first is final, the last is the filter's. They are
+        NaN for r < 1, for which there is no term. `observation` is y_t, None if it is missing;
+        `inputs` are u_t.
         """
         key_step, key_draws = jax.random.split(key)
         seen = None if observation is None else one_observation(observation, self.filter.model)
@@ -219,9 +220,10 @@ class FixedLagSmoother(Checked):
         return *_advanced(self, key_draws, window, moved, inputs), info
 
     def variances(self, window: Window) -> PyTree:
-        """Var[h(x_{r-1}, x_r) | y_1..y_t] for the r of the estimates, of each number apart.
+        """Var[h(x_{r-1}, x_r) | y_1..y_t] for the r of the estimates, of each entry separately.
 
-        It is about the mean: E[h²] - E[h]² would be rounding alone where h is far from zero.
+        It is computed about the mean, because E[h²] - E[h]² would be only rounding error if h is
+        far from zero.
         """
         return _estimates(self, window).variances
 

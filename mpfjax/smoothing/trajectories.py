@@ -49,32 +49,32 @@ def sample_trajectories(
 
     Backward sampling (Godsill, Doucet and West 2004): x_t is drawn by the weights of the last
     mixture, then each x_{s} by W_s^i D(x_{s+1} | x_s^i), W_s the joint weights of the mixture at s.
-    Component indicators have no part in it, since the weights are joint: a mixture filter is
-    smoothed like any other.
+    Component indicators do not enter, because the weights are joint: a mixture filter is smoothed
+    like any other.
 
     - `mixtures`: a run of `run_filter(..., collect=None)`, or the mixtures that it collected.
     - `num_trajectories`: k. Leaves of the result are (k, t + 1, ...); (k, t, ...), without x_0, for
       mixtures alone.
-    - `component`: draw x_t from this component of the last mixture alone: the past of one mode.
-    - `method`: "exact" weighs all N particles, O(N) for a trajectory and step. "mcmc" (Dau and
+    - `component`: draw x_t from this component of the last mixture only: the past of one mode.
+    - `method`: "exact" weights all N particles, O(N) per trajectory and step. "mcmc" (Dau and
       Chopin 2023) starts at the ancestor of x_{s+1} and makes `num_moves` steps of independent
-      Metropolis-Hastings, with proposals by W_s: O(1) for a trajectory and step. It is as exact as
-      N grows.
+      Metropolis-Hastings, with proposals by W_s: O(1) per trajectory and step. It becomes as
+      accurate as N grows.
     - `num_moves`: of "mcmc".
-    - `inputs`: u_1, ..., u_t, the known inputs that the run had, where no `Series` says them.
-    - `observations`: y_1..y_t, arrays or a `Series`, which a conditionally linear model needs and
-      no other takes; a NaN is a missing number.
-      Backward sampling is then that of Lindsten, Bunch, Särkkä, Schön and Godsill (2016): latents
-      are drawn, and the result is a `MarginalisedState` of them with the mean and the covariance of
-      each x_s given these and y_1..y_t. It needs a whole run, with x_0, and method "exact".
+    - `inputs`: u_1, ..., u_t, the known inputs of the run, unless a `Series` contains them.
+    - `observations`: y_1..y_t, arrays or a `Series`, required by a conditionally linear model and
+      by no other; a NaN is a missing number. Backward sampling is then the method of Lindsten,
+      Bunch, Särkkä, Schön and Godsill (2016): latents are drawn, and the result is a
+      `MarginalisedState` of them with the mean and the covariance of each x_s given these and
+      y_1..y_t. It requires a whole run, with x_0, and method "exact".
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
-    that is not there or dead, a run with restarts, and for "mcmc" where particles have no single
-    ancestors (an index below 0; both a RuntimeError within jit); a RuntimeError where no particle
-    can have moved to the next. If the backward weights degenerate, so that at some time fewer than
-    a tenth of the trajectories are distinct, a RuntimeWarning names the share. Use it for estimates
-    of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but has few
-    distinct states at early times.
+    that does not exist or is empty, a run with restarts, and for "mcmc" if particles have no single
+    ancestors (an index below 0; both a RuntimeError within jit); a RuntimeError if no particle can
+    have moved to the next. If the backward weights degenerate, so that at some time fewer than a
+    tenth of the trajectories are distinct, a RuntimeWarning reports the fraction. Use it for
+    estimates of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but
+    has few distinct states at early times.
     """
     if not is_mixed(model):
         require(model, "log_transition", "sample_trajectories")
