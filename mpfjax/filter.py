@@ -35,7 +35,10 @@ from mpfjax.operations.random import split
 from mpfjax.operations.stored import drawn_once
 from mpfjax.report import StepInfo, report_of
 
-BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
+BROKEN_DENSITY = (
+    "model: a density was NaN or infinite for some particle, or GroupBy: group gave a label outside"
+    " [0, M)"
+)
 
 
 class Filter(eqx.Module):
@@ -248,12 +251,11 @@ def periods_of(model: Any) -> PyTree:
 def with_densities(value: PyTree, increments: Float[Array, "*runs_and_t"]) -> PyTree:
     """`value`, or a RuntimeError where an increment of log Ẑ is NaN or +inf.
 
-    A program that raises errors itself calls back into Python, and such a program cannot be kept
-    for the next process. So increments are looked at after it has ended. Under the caller's own jit
-    the error is raised while the program runs.
+    A program cannot raise, so increments are looked at after it has ended. Under the caller's own
+    jit nothing is raised: look at `StepInfo.broken` or `FilterRun.broken` outside.
     """
     if isinstance(increments, Tracer):
-        return eqx.error_if(value, ~(increments < jnp.inf), BROKEN_DENSITY)
+        return value
     broken = ~(np.asarray(increments) < np.inf)
     if broken.any():
         step = int(np.argmax(broken.any(axis=tuple(range(broken.ndim - 1))))) if broken.ndim else 0

@@ -425,6 +425,13 @@ class ParticleMixture(eqx.Module):
         """The mixture of a step in which each component's particles are in an order, or not."""
         return self._within(in_order=in_order)
 
+    def broken_where(self, fault: Bool[Array, "..."]) -> "ParticleMixture":
+        """The mixture, whose increment of log Ẑ is NaN if there is any fault."""
+        growth = jnp.where(jnp.any(fault), jnp.nan, 0.0).astype(self.log_scale.dtype)
+        if self.within is None:
+            return self.replace(log_scale=self.log_scale + growth)
+        return self._within(log_increment=self.within.log_increment + growth)
+
     def _within(self, **fields: PyTree) -> "ParticleMixture":
         if self.within is None:
             return self

@@ -19,6 +19,8 @@ class StepInfo(eqx.Module):
     - `resampled`: which components of the previous mixture were resampled.
     - `degenerate`: whether every particle had zero likelihood: the weights are then those of the
       prediction.
+    - `broken`: whether the increment is NaN or +inf, because a density of the model is, or because
+      an observation has NaN. Within a caller's `jax.jit` nothing can be raised: check it outside.
     - `labels_ran_out`: whether all M > 1 labels are in use, so that further modes share one; see
       `Split.is_diffuse`.
     - `log_marginal_likelihood_error`: the standard error of log Ẑ of all steps so far, from this
@@ -42,6 +44,11 @@ class StepInfo(eqx.Module):
     mixture_weight_errors: Float[Array, " m"] | None = None
     log_evidence_against_start: Float[Array, ""] | None = None
     surprised: Bool[Array, ""] | None = None
+
+    @property
+    def broken(self) -> Bool[Array, "..."]:
+        """Whether the increment of log Ẑ is NaN or +inf."""
+        return ~(self.log_likelihood_increment < jnp.inf)
 
 
 def report_of(

@@ -123,7 +123,7 @@ def as_arrays(observations: PyTree, name: str = "observations", in_time: bool = 
 def one_observation(observation: PyTree, model: Any = None) -> PyTree:
     """The arrays of y_t; a `ValueError` for none, anything but numbers, and what a model refuses.
 
-    Under the caller's own jit, the program raises for a number that the model refuses.
+    Under the caller's own jit, numbers are all NaN where the model refuses one of them.
     """
     arrays = as_arrays(observation, "observation", in_time=False)
     refused = "" if model is None else refused_by(model)
@@ -224,14 +224,28 @@ def _steps_where(arrays: PyTree, combine: str, holds: Callable[[Any, Any], Any])
 def refused_where(broken: Any, tree: PyTree, fault: str, hint: str = "") -> PyTree:
     """The tree; a `ValueError` where it is broken, that names the first of several steps.
 
-    Within a caller's jit no value can be named, and the check runs with the caller's program.
+    A program cannot raise. So within a caller's jit it goes on with NaN, see `spoiled`.
     """
     if isinstance(broken, Tracer):
-        return eqx.error_if(tree, broken, fault)
+        return spoiled(tree, broken)
     if broken.any():
         at = f" at index {int(np.argmax(broken))} of the leading axis" if broken.ndim else ""
         raise ValueError(f"{fault}{at}{hint}")
     return tree
+
+
+def spoiled(tree: PyTree, broken: Bool[Array, "..."]) -> PyTree:
+    """The tree, with NaN for all its floating point numbers if anything is broken.
+
+    NaN goes through to all results that depend on them, so that whoever called the program can see
+    it. An error raised by the program itself would call back into Python: such a program runs on
+    the platform alone for which it was compiled, and cannot be kept for the next process.
+    """
+    is_broken = jnp.any(broken)
+    return jax.tree.map(
+        lambda leaf: jnp.where(is_broken, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf,
+        tree,
+    )
 
 
 def _length(arrays: PyTree, tree: PyTree, name: str) -> int:

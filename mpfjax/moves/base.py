@@ -235,8 +235,15 @@ class AbstractRegrouping(AbstractMove):
         if mixture.num_components == 1 or is_missing(now):
             return mixture
         # Indicators are whole numbers and have no derivative.
-        indicators, memory = self.regroup(key, jax.lax.stop_gradient(mixture))
-        return mixture.replace(component_indicators=indicators, memory=memory)
+        return self.regrouped(mixture, *self.regroup(key, jax.lax.stop_gradient(mixture)))
+
+    def regrouped(
+        self, mixture: ParticleMixture, indicators: Int[Array, " n"], memory: dict[str, PyTree]
+    ) -> ParticleMixture:
+        """The mixture with these indicators, broken if a particle's is outside of [0, M)."""
+        inside = jnp.clip(indicators, 0, mixture.num_components - 1)
+        regrouped = mixture.replace(component_indicators=inside, memory=memory)
+        return regrouped.broken_where(mixture.occupied & (inside != indicators))
 
     def around(self, reference: Any) -> "AbstractRegrouping":
         """The move itself, for which all particles are alike."""

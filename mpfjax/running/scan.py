@@ -34,6 +34,8 @@ class FilterRun(eqx.Module):
     - `final`: the mixture after the last step.
     - `resampled`: which components each step resampled.
     - `degenerate`: the steps at which every particle had zero likelihood.
+    - `broken`: the steps whose increment is NaN or +inf. Within a caller's `jax.jit` nothing can be
+      raised: check it outside.
     - `effective_sample_size`: 1 / Σ W², of the joint weights W of all particles after each step.
     - `log_evidence_against_start`: that of each step's `StepInfo`, and None unless a move of the
       filter tells it.
@@ -52,6 +54,11 @@ class FilterRun(eqx.Module):
     effective_sample_size: Float[Array, " t"]
     log_evidence_against_start: Float[Array, " t"] | None = None
     surprised: Bool[Array, " t"] | None = None
+
+    @property
+    def broken(self) -> Bool[Array, "..."]:
+        """The steps whose increment of log Ẑ is NaN or +inf."""
+        return ~(self.log_likelihood_increments < jnp.inf)
 
 
 def scan(

@@ -7,9 +7,10 @@ joint weights of the mixture at s. Component indicators do not enter, because th
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
@@ -19,11 +20,12 @@ from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.prefix_sums import needs_units, sum_before, to_units, unit_bits
 from mpfjax.operations.random import below, split, uniform
+from mpfjax.operations.rows import along_rows
 from mpfjax.operations.stored import take
 
 # How many densities are held at once: rows of states are taken together up to this.
 MOST_DENSITIES = 2**22
-_NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
+NO_TRANSITION = "model: log_transition is -inf, or NaN, from every particle of the step before"
 
 
 def draw(
@@ -81,14 +83,12 @@ def draw_exactly(
     mixture: ParticleMixture,
     num_draws: int = 1,
     needed: Bool[Array, " k"] | None = None,
-    checked: bool = True,
     cost: int = 1,
 ) -> Int[Array, "k draws"]:
     """Indices for each of the futures by W^i times its density given x^i, O(N) for one.
 
     `log_density` gives that of one future for all particles, (n,), at the `cost` of so many numbers
-    a particle. An error at run time where a future that is `needed` cannot have come from any
-    particle; any index there where that is not `checked`.
+    a particle. The index is -1 where a future that is `needed` cannot have come from any particle.
     """
     n = mixture.num_particles
 
@@ -111,7 +111,7 @@ def draw_exactly(
         indices, largest = jax.vmap(draw_some)(inputs)
     else:
         indices, largest = jax.lax.map(draw_some, inputs, batch_size=together)
-    return _with_a_past(indices, largest, needed) if checked else indices
+    return _or_none(indices, largest[:, None], None if needed is None else needed[:, None])
 
 
 def walk(
@@ -126,7 +126,7 @@ def walk(
     """Steps of independent Metropolis-Hastings on the index, whose target is W^i D(next | x^i).
 
     O(1) for a state and step; the index after each of the steps. `proposed` are draws by
-    the weights alone, which can all be made beforehand.
+    the weights alone, which can all be made beforehand. The index is -1 as by `draw_exactly`.
     """
 
     def log_density(indices: Int[Array, " k"]) -> Float[Array, " k"]:
@@ -147,7 +147,7 @@ def walk(
     first = (start, log_density(start))
     log_uniforms = jnp.log(uniform(key, proposed.shape, mixture.log_weights.dtype))
     (_, current), indices = jax.lax.scan(move, first, (proposed, log_uniforms))
-    return _with_a_past(indices, current, needed)
+    return _or_none(indices, current, needed)
 
 
 def log_transitions(model: Any, trajectory: PyTree, inputs: PyTree) -> Float[Array, " t"]:
@@ -164,8 +164,28 @@ def log_transitions(model: Any, trajectory: PyTree, inputs: PyTree) -> Float[Arr
     return jax.vmap(at_step)(inputs, after, before)
 
 
-def _with_a_past(
-    indices: Int[Array, "..."], log_density: Float[Array, " k"], needed: Bool[Array, " k"] | None
+def _or_none(
+    indices: Int[Array, "..."],
+    log_density: Float[Array, "..."],
+    needed: Bool[Array, "..."] | None,
 ) -> Int[Array, "..."]:
+    """The indices, -1 where a future that is needed has no past."""
     lost = ~(log_density > -jnp.inf)
-    return eqx.error_if(indices, jnp.any(lost if needed is None else lost & needed), _NO_PAST)
+    return jnp.where(lost if needed is None else lost & needed, -1, indices)
+
+
+def rows_at(indices: Int[Array, " k"], rows: PyTree) -> PyTree:
+    """The rows with these indices; those of index -1 have NaN for floating point numbers."""
+    chosen = jax.tree.map(lambda leaf: take(leaf, jnp.maximum(indices, 0)), rows)
+
+    def with_nan(leaf: Array) -> Array:
+        is_float = jnp.issubdtype(leaf.dtype, jnp.inexact)
+        return jnp.where(along_rows(indices < 0, leaf), jnp.nan, leaf) if is_float else leaf
+
+    return jax.tree.map(with_nan, chosen)
+
+
+def check_pasts(indices: Int[Array, "..."]) -> None:
+    """Raise a `RuntimeError` where a state has no past; within a caller's jit there are NaN."""
+    if not isinstance(indices, Tracer) and np.any(np.asarray(indices) < 0):
+        raise RuntimeError(NO_TRANSITION)

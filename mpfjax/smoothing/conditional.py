@@ -103,11 +103,10 @@ def renew(
     series: Series,
     trajectory: PyTree,
     backward: bool,
-    checked: bool = True,
 ) -> ConditionalRun:
     """`conditional_filter` under the caller's jit, its arguments unchecked.
 
-    Where the backward sampling is not `checked` either, look at `possible_times`.
+    Backward sampling may find no past: look at `possible_times` of the new trajectory.
     """
     key_slot, key_initial, key_run, key_back = split(key, 4)
     n = filter.num_particles
@@ -127,7 +126,7 @@ def renew(
     slots = run.collected.memory[REFERENCE].slot
     log_weights = jax.vmap(at)(run.collected.log_weights, slots)
     seen = (log_weights > -jnp.inf) & ~run.degenerate
-    drawn = draw_trajectory(key_back, filter.model, run, series.inputs, backward, checked)
+    drawn = draw_trajectory(key_back, filter.model, run, series.inputs, backward)
     return ConditionalRun(
         trajectory=drawn,
         run=run,
@@ -145,12 +144,11 @@ def draw_trajectory(
     run: FilterRun,
     inputs: PyTree,
     backward: bool,
-    checked: bool = True,
 ) -> PyTree:
     """One trajectory of a run, by backward sampling or the genealogy: leaves (t + 1, ...)."""
     mixtures = mixtures_of(run)
     if backward:
-        drawn, _ = draw_trajectories(key, model, mixtures, inputs, 1, checked=checked)
+        drawn, _ = draw_trajectories(key, model, mixtures, inputs, 1)
     else:
         end = draw(key, (1,), mixtures.log_weights[-1])
         drawn = paths_through(mixtures, ancestors_of(end, mixtures))

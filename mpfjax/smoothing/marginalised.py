@@ -37,8 +37,7 @@ from mpfjax.models.gaussians import (
 from mpfjax.models.law import law_of
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
-from mpfjax.operations.stored import take
-from mpfjax.smoothing.backward import draw_ends, draw_exactly, ended
+from mpfjax.smoothing.backward import draw_ends, draw_exactly, ended, rows_at
 
 
 class Information(NamedTuple):
@@ -77,7 +76,7 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
         step_key, earlier, observation, now = step
         moved_by = with_inputs(model, now)
         indices = _indices(step_key, moved_by, observation, latent, future, earlier)
-        before = jax.tree.map(lambda leaf: take(leaf, indices), earlier.particles)
+        before = rows_at(indices, earlier.particles)
         future = _before(moved_by, observation, latent, before, future)
         return (before.latent, future), (before.latent, future, indices)
 

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.checks import Checked, CountOrZero, check_one_each, checked, saying
@@ -19,10 +20,16 @@ from mpfjax.models.observations import as_series, one_input, one_observation
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.logarithms import as_inexact
 from mpfjax.operations.random import split
-from mpfjax.operations.stored import take
 from mpfjax.report import StepInfo
 from mpfjax.running.scan import FilterRun, first_mixture, report_of, run_of, sound, step_or_predict
-from mpfjax.smoothing.backward import draw, draw_exactly, log_kernel_from, walk
+from mpfjax.smoothing.backward import (
+    NO_TRANSITION,
+    draw,
+    draw_exactly,
+    log_kernel_from,
+    rows_at,
+    walk,
+)
 from mpfjax.smoothing.history import NO_PAST
 
 # Particles drawn for each particle's past. With one, few distinct particles of early times are
@@ -88,7 +95,9 @@ def smoothed_sums(
         lag = min(lag, series.length - 1)
     smoother = FixedLagSmoother(filter, function, lag or 0, method)
     sums = _smooth(key, smoother, series, lag)
-    return eqx.tree_at(lambda sums: sums.run, sums, sound(sums.run))
+    sums = eqx.tree_at(lambda sums: sums.run, sums, sound(sums.run))
+    _check_sums(sums.sums)
+    return sums
 
 
 @jit_with_floats_traced
@@ -217,7 +226,9 @@ class FixedLagSmoother(Checked):
         seen = None if observation is None else one_observation(observation, self.filter.model)
         moved, info = self.filter._run(key_step, window.mixture, seen, inputs)
         inputs = one_input(inputs, self.filter.model)
-        return *_advanced(self, key_draws, window, moved, inputs), info
+        window, estimates = _advanced(self, key_draws, window, moved, inputs)
+        _check_sums(jax.tree.map(lambda leaf: leaf[-1], estimates))
+        return window, estimates, info
 
     def variances(self, window: Window) -> PyTree:
         """Var[h(x_{r-1}, x_r) | y_1..y_t] for the r of the estimates, of each entry separately.
@@ -249,8 +260,7 @@ class FixedLagSmoother(Checked):
         Leaves of the first are (any, n, ...) as they were, of the second (n, ...).
         """
         model = with_inputs(self.filter.model, inputs)
-        anew = jnp.any(moved.began_anew & moved.occupied)
-        needed, start = eqx.error_if((moved.occupied, moved.ancestor_indices), anew, NO_PAST)
+        needed, start = moved.occupied, moved.ancestor_indices
         if self.method == "exact":
             log_kernel = log_kernel_from(model, mixture)
             indices = draw_exactly(key, log_kernel, moved.particles, mixture, _DRAWS, needed)
@@ -260,14 +270,14 @@ class FixedLagSmoother(Checked):
             proposed = draw(key_proposed, shape, mixture.log_weights)
             later = walk(key_walk, model, moved.particles, mixture, start, proposed, needed).T
             indices = jnp.concatenate([start[:, None], later], axis=1)
-        places = indices.reshape(-1)
-        earlier = jax.tree.map(lambda leaf: take(leaf, places), mixture.particles)
+        places = jnp.where((moved.began_anew & needed)[:, None], -1, indices).reshape(-1)
+        earlier = rows_at(places, mixture.particles)
         repeat = partial(jnp.repeat, repeats=_DRAWS, axis=0)
         values = self._of_states(earlier, jax.tree.map(repeat, moved.particles))
         no_spread = jax.tree.map(lambda leaf: jnp.zeros_like(jnp.real(leaf)), values)
 
         def of_past(term: Terms) -> Terms:
-            drawn = jax.tree.map(partial(take, indices=places), term)
+            drawn = rows_at(places, term)
             return _over_draws(drawn)
 
         return jax.vmap(of_past)(terms), _over_draws(Terms(values, no_spread))
@@ -278,6 +288,15 @@ class FixedLagSmoother(Checked):
             values = mapped(self.filter.model, self.function)(previous, states)
         check_one_each(jax.tree.leaves(states)[0].shape[0], function=values)
         return jax.tree.map(as_inexact, values)
+
+
+def _check_sums(sums: PyTree) -> None:
+    """Raise a `RuntimeError` where they are NaN; within a caller's jit they stay so."""
+    leaves = jax.tree.leaves(sums)
+    if not any(isinstance(leaf, Tracer) for leaf in leaves) and any(
+        np.isnan(leaf).any() for leaf in leaves
+    ):
+        raise RuntimeError(f"function: a sum is NaN. Either {NO_TRANSITION}; or {NO_PAST}")
 
 
 def _over_draws(terms: Terms) -> Terms:

@@ -24,7 +24,16 @@ from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
 from mpfjax.running.scan import FilterRun
-from mpfjax.smoothing.backward import draw, draw_ends, draw_exactly, ended, log_kernel_from, walk
+from mpfjax.smoothing.backward import (
+    check_pasts,
+    draw,
+    draw_ends,
+    draw_exactly,
+    ended,
+    log_kernel_from,
+    rows_at,
+    walk,
+)
 from mpfjax.smoothing.history import mixtures_of, with_parents
 from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
@@ -70,11 +79,11 @@ def sample_trajectories(
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
     that does not exist or is empty, a run with restarts, and for "mcmc" if particles have no single
-    ancestors (an index below 0; both a RuntimeError within jit); a RuntimeError if no particle can
-    have moved to the next. If the backward weights degenerate, so that at some time fewer than a
-    tenth of the trajectories are distinct, a RuntimeWarning reports the fraction. Use it for
-    estimates of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but
-    has few distinct states at early times.
+    ancestors (an index below 0); a RuntimeError if no particle can have moved to the next. Within
+    a caller's jit, states are NaN in place of these errors. If the backward weights degenerate, so
+    that at some time fewer than a tenth of the trajectories are distinct, a RuntimeWarning reports
+    the fraction. Use it for estimates of the past. The genealogy of the particles
+    (`trace_ancestors`) is exact as well, but has few distinct states at early times.
     """
     if not is_mixed(model):
         require(model, "log_transition", "sample_trajectories")
@@ -103,6 +112,7 @@ def sample_trajectories(
             stacked = with_parents(stacked, "sample_trajectories with method 'mcmc', not 'exact',")
         options = (num_trajectories, component, 0 if method == "exact" else num_moves)
         drawn, indices = draw_trajectories(key, model, stacked, inputs, *options)
+    check_pasts(indices)
     _warn_of_few(indices, stacked)
     return drawn
 
@@ -115,12 +125,10 @@ def _check_component(mixtures: ParticleMixture, component: int) -> None:
 
 
 @jit_on_wide_vectors
-def draw_trajectories(
-    key, model, mixtures, inputs, num_trajectories, component=None, num_moves=0, checked=True
-):
+def draw_trajectories(key, model, mixtures, inputs, num_trajectories, component=None, num_moves=0):
     """`sample_trajectories` without its checks of arguments, and the particles' indices, (t, k).
 
-    `inputs` are those of the steps between mixtures; `checked` as for `draw_exactly`.
+    `inputs` are those of the steps between mixtures; indices are -1 as by `draw_exactly`.
     """
     key_final, key_steps, key_proposed = split(key, 3)
     last, states = draw_ends(key_final, mixtures, num_trajectories, component)
@@ -131,12 +139,12 @@ def draw_trajectories(
         moved_by = with_inputs(model, now)
         if proposed is None:
             log_kernel = log_kernel_from(moved_by, earlier)
-            drawn = draw_exactly(step_key, log_kernel, next_states, earlier, checked=checked)
+            drawn = draw_exactly(step_key, log_kernel, next_states, earlier)
             indices = drawn[:, 0]
         else:
-            start = take(ancestors, next_indices)
+            start = take(ancestors, jnp.maximum(next_indices, 0))
             indices = walk(step_key, moved_by, next_states, earlier, start, proposed)[-1]
-        states = jax.tree.map(lambda leaf: take(leaf, indices), earlier.particles)
+        states = rows_at(indices, earlier.particles)
         return (states, indices), (states, indices)
 
     num_earlier = mixtures.log_weights.shape[0] - 1

@@ -200,9 +200,7 @@ class _Kernel(AbstractKernel):
         key_run, key_back = jax.random.split(key)
         filter, series = self.problem.at(reals), self.problem.objective.series
         run = scan(key_run, filter, series, None)
-        drawn = draw_trajectory(
-            key_back, filter.model, run, series.inputs, self.backward, checked=False
-        )
+        drawn = draw_trajectory(key_back, filter.model, run, series.inputs, self.backward)
         fine = jnp.all(jnp.isfinite(run.log_likelihood_increments))
         if self.prior is not None:
             fine &= jnp.isfinite(self.prior(reals))
@@ -216,7 +214,7 @@ class _Kernel(AbstractKernel):
         reals, accepted, invalid = move(key_parameters, state.reals, state.trajectory, walk)
         filter, before = self.problem.at(reals), state.trajectory
         series = self.problem.objective.series
-        found = renew(key_trajectory, filter, series, before, self.backward, checked=False)
+        found = renew(key_trajectory, filter, series, before, self.backward)
         possible = possible_times(filter.model, found.trajectory, series.inputs)
         broken = jnp.any(is_invalid(found.run.log_likelihood_increments))
         broken |= ~jnp.all(found.possible & possible)

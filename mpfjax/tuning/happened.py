@@ -188,7 +188,7 @@ def _runs_again(problem, evidence, rows, whole, backward):
         (runs,) = evidence.runs(key_run, filter, whole)
         run = jax.tree.map(lambda leaf: leaf[0], runs)
         if whole:
-            states = draw_trajectory(key, filter.model, run, inputs, backward, checked=False)
+            states = draw_trajectory(key, filter.model, run, inputs, backward)
         else:
             states = _one_of(key, run.final)
         return states, run.log_marginal_likelihood

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
@@ -56,7 +57,7 @@ def test_the_folder_is_the_users_own_unless_jax_has_one(settings, tmp_path):
 
 @pytest.mark.exactness
 @pytest.mark.parametrize("transformed", [eqx.Partial, eqx.filter_jit])
-def test_a_step_raises_of_what_it_saw_and_its_program_calls_nothing_back(transformed):
+def test_a_step_says_what_it_saw_and_its_program_calls_nothing_back(transformed):
     """No program with a call back into Python is kept for the next process."""
     filter = mpfjax.particle_filter(mpfjax.QuadraticModel(), 8)
     key, mixture = jax.random.key(0), filter.init(jax.random.key(0))
@@ -64,7 +65,10 @@ def test_a_step_raises_of_what_it_saw_and_its_program_calls_nothing_back(transfo
     assert "callback" not in program.as_text()
     step = transformed(lambda observation: filter.step(key, mixture, observation))
     assert step(jnp.ones(()))[0].num_particles == 8
-    with pytest.raises((ValueError, RuntimeError), match="observation: NaN or infinite"):
-        jax.block_until_ready(step(jnp.full((), jnp.nan)))
-    with pytest.raises(RuntimeError, match="observation: NaN or infinite"):
-        jax.block_until_ready(jax.vmap(step)(jnp.array([1.0, jnp.inf])))
+    if transformed is eqx.Partial:
+        with pytest.raises(ValueError, match="observation: NaN or infinite"):
+            step(jnp.full((), jnp.nan))
+    else:
+        assert step(jnp.full((), jnp.nan))[1].broken
+    info = jax.vmap(step)(jnp.array([1.0, jnp.inf]))[1]
+    np.testing.assert_array_equal(info.broken, [False, True])

@@ -142,5 +142,4 @@ def test_a_trajectory_of_density_zero_is_named(trajectory, index):
     with pytest.raises(ValueError, match=f"trajectory: .*zero or NaN at index {index}"):
         call(trajectory)
     if index == 2:
-        with pytest.raises(RuntimeError, match=r"zero or NaN|log_transition is -inf"):
-            jax.jit(call)(jnp.array(trajectory))
+        assert np.isnan(jax.jit(call)(jnp.array(trajectory)).trajectory).all()

@@ -107,8 +107,8 @@ def test_what_follows_ancestors_refuses_particles_without_one_parent():
     ):
         with pytest.raises(ValueError, match=f"mixtures: .*{named}"):
             follow(run)
-        with pytest.raises(RuntimeError, match=named):
-            jax.block_until_ready(jax.jit(follow)(run))
+        paths = jax.jit(follow)(run)
+        assert np.isnan(getattr(paths, "trajectories", paths)).all()
     with pytest.raises(ValueError, match=r"leaves no particle one parent.* smoothed_sums"):
         smoothed_sums(key, filter, seen, total, method="mcmc")
     with pytest.raises(ValueError, match=r"leaves no particle one parent.* with_eve"):
