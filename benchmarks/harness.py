@@ -36,7 +36,7 @@ from tqdm import tqdm
 import mpfjax
 from mpfjax import console
 from mpfjax.console import exit_status, format_table, write_json
-from mpfjax.running.storage import write_whole
+from mpfjax.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[1]
 Z_95 = 1.959963984540054
