@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from mpfjax.files import write_whole
+
 _MOST_SHOWN = 4
 _DESCRIPTION = "description"
 
