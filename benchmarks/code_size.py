@@ -43,15 +43,15 @@ def lines_in(folder: Path) -> int:
 
 def lines_of_code(text: str, tree: ast.Module) -> int:
     """Lines that are neither blank, nor a comment, nor in a docstring."""
-    told: set[int] = set()
+    docstring_lines: set[int] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and node.body:
             first = node.body[0]
             if ast.get_docstring(node) is not None:
-                told |= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+                docstring_lines |= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
     lines = enumerate(text.splitlines(), 1)
     return sum(
-        bool(line.strip()) and not line.strip().startswith("#") and number not in told
+        bool(line.strip()) and not line.strip().startswith("#") and number not in docstring_lines
         for number, line in lines
     )
 

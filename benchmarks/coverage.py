@@ -57,7 +57,7 @@ def coverage(
         on_object += [bool(row.any()) for row in hits]
         strays = covers(boxes[:, 2:], others[others[:, 0] == frame, 2:])
         on_other += [
-            bool(other.any() and not own.any()) for other, own in zip(strays, hits, strict=True)
+            bool(other.any() and not hit.any()) for other, hit in zip(strays, hits, strict=True)
         ]
         swaps += _reassign(identity, boxes, truth, hits)
     return Coverage(
@@ -86,21 +86,21 @@ def _reassign(
 ) -> int:
     """Update which track each object is assigned to, and count the swaps."""
     tracks, ids = boxes[:, 1].astype(int), truth[:, 1].astype(int)
-    kept = [
+    pairs = [
         (i, j)
         for j, id in enumerate(ids)
         for i in np.flatnonzero(tracks == identity.get(id))
         if hits[i, j]
     ]
-    taken: set[int] = {int(i) for i, _ in kept}
-    settled = {j for _, j in kept}
+    rows: set[int] = {int(i) for i, _ in pairs}
+    columns = {j for _, j in pairs}
     distance = np.sum((_offsets(boxes[:, 2:], truth[:, 2:]) / np.array(REACH)) ** 2, axis=-1)
     swaps = 0
     for i, j in sorted(np.argwhere(hits).tolist(), key=lambda pair: distance[tuple(pair)]):
-        if i in taken or j in settled:
+        if i in rows or j in columns:
             continue
         swaps += int(ids[j]) in identity
         identity[int(ids[j])] = int(tracks[i])
-        taken.add(i)
-        settled.add(j)
+        rows.add(i)
+        columns.add(j)
     return swaps

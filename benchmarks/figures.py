@@ -176,8 +176,8 @@ def draw_panels(
             axis.set_axis_off()
         for axis, panel in zip(row_axes, row, strict=False):
             _draw_panel(axis, panel, names, scales)
-    found = [axis.get_legend_handles_labels() for axis in axes.flat]
-    handles = {label: handle for each in found for handle, label in zip(*each, strict=True)}
+    legends = [axis.get_legend_handles_labels() for axis in axes.flat]
+    handles = {label: handle for each in legends for handle, label in zip(*each, strict=True)}
     # In inches, of a name and its marker at this size of letters: a wider legend would be cut off.
     column = 0.55 + 0.07 * max(map(len, names))
     figure.legend(

@@ -90,12 +90,12 @@ def main(
             row: dict[str, Any] = {"CPU seconds": f"{job:40s}"}
             for name, root in roots.items():
                 try:
-                    found: list[Any] = least(arguments, root, bytecode, rounds)
+                    figures: list[Any] = least(arguments, root, bytecode, rounds)
                 except ValueError:  # an earlier version may have no such command yet
                     if root is ROOT:
                         raise
-                    found = ["-"] * len(FIGURES)
-                row |= {f"{name}, {each}": x for each, x in zip(FIGURES, found, strict=True)}
+                    figures = ["-"] * len(FIGURES)
+                row |= {f"{name}, {each}": x for each, x in zip(FIGURES, figures, strict=True)}
             results.append(row)
             lines = table(None, [row]).splitlines()
             print("\n".join(lines if len(results) == 1 else lines[-1:]))
@@ -109,12 +109,12 @@ def least(job: Arguments, root: Path, bytecode: Path, rounds: int) -> list[float
 
     One has an empty folder of programs, the other what that has left there.
     """
-    found = []
+    runs = []
     for _ in range(rounds):
         with tempfile.TemporaryDirectory() as folder:
-            found.append([spent(job, root, Path(folder), bytecode) for _ in range(2)])
-    cold, kept = (Spent(*figures) for figures in np.array(found).min(axis=0).tolist())
-    return [cold.cpu, kept.cpu, kept.wall, kept.memory]
+            runs.append([spent(job, root, Path(folder), bytecode) for _ in range(2)])
+    cold, warm = (Spent(*figures) for figures in np.array(runs).min(axis=0).tolist())
+    return [cold.cpu, warm.cpu, warm.wall, warm.memory]
 
 
 def spent(job: Arguments, root: Path, programs: Path, bytecode: Path) -> Spent:
@@ -126,8 +126,8 @@ def spent(job: Arguments, root: Path, programs: Path, bytecode: Path) -> Spent:
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
-    found, lines = in_process(*job, root=root, **settings)
-    return found._replace(**json.loads(lines[-1])) if job[0] == "-c" and lines else found
+    usage, lines = in_process(*job, root=root, **settings)
+    return usage._replace(**json.loads(lines[-1])) if job[0] == "-c" and lines else usage
 
 
 def jobs(scene: Path, out: Path, data: Path) -> dict[str, Arguments]:
@@ -154,9 +154,9 @@ def jobs(scene: Path, out: Path, data: Path) -> dict[str, Arguments]:
     truth = np.loadtxt(scene / "gt.txt", delimiter=",", max_rows=8)
     inside = truth[(truth[:, 2:4] >= 0).all(axis=1)][0]
     box = f"--box={','.join(f'{value:.0f}' for value in inside[2:6])}"
-    found = {"import mpfjax": ("-c", "import mpfjax")}
-    found |= {name: ("-c", _BEGIN + call + _END) for name, call in calls.items()}
-    found |= {
+    calls_by_name = {"import mpfjax": ("-c", "import mpfjax")}
+    calls_by_name |= {name: ("-c", _BEGIN + call + _END) for name, call in calls.items()}
+    calls_by_name |= {
         "mpfjax track, detections, one frame": track(first, "--detections", detections, *only),
         "mpfjax track, detections": track(scene, "--detections", detections),
         "mpfjax track, detections alone": track(scene / "det.txt"),
@@ -165,9 +165,9 @@ def jobs(scene: Path, out: Path, data: Path) -> dict[str, Arguments]:
     }
     if pets.is_dir():
         name = "mpfjax track, 795 frames of PETS"
-        found[name] = track(pets, "--detections", str(pets / "det.txt"))
+        calls_by_name[name] = track(pets, "--detections", str(pets / "det.txt"))
     command = "-m", "benchmarks.score_vs_particles", "--out", str(out)
-    return found | {"README's first command": command}
+    return calls_by_name | {"README's first command": command}
 
 
 def render(folder: Path) -> Path:

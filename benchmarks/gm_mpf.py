@@ -87,7 +87,7 @@ def main(
     # What each mixture has with a great many particles, E(x_t | y_1..y_t), (t, 2 targets, 2): the
     # distance from it is what more particles can mend, and the rest of the distance from the true
     # box is the model's, or the annotation's.
-    own = {name: run_filter(name, reference, targets, seed + 1, 4).estimates.mean(axis=0)
+    limits = {name: run_filter(name, reference, targets, seed + 1, 4).estimates.mean(axis=0)
            for name in names if name in ("mpf", "gm_mpf")}  # fmt: skip
     results: list[dict[str, Any]] = []
     steps: dict[str, Step] = {}
@@ -101,8 +101,8 @@ def main(
             "rmse_std": errors.std(axis=0), "both_held": held(step, targets.truth).mean(),
             "n_eff": step.effective_sample_size.mean(),
         })  # fmt: skip
-        if name in own:
-            errors = errors_of(step.estimates, own[name])
+        if name in limits:
+            errors = errors_of(step.estimates, limits[name])
             results[-1]["monte_carlo_error"] = errors.mean(axis=0)
         content = {"timing": timing, "results": results}
         harness.data(out / "gm_mpf.json", settings=settings, **content)
@@ -154,7 +154,7 @@ def open_targets(
     boxes = boxes_over_time(rows, ids, first, len(stills))
     for t, target in np.argwhere(np.isnan(boxes).any(axis=2)):
         raise ValueError(f"--ids: object {ids[target]} has no box in frame {first + t}")
-    truth = box_files.centred(boxes.reshape(-1, 4)).reshape(boxes.shape)
+    truth = box_files.to_centre(boxes.reshape(-1, 4)).reshape(boxes.shape)
     return Targets(name, stills, first, truth)
 
 
@@ -218,8 +218,8 @@ class Collect(eqx.Module):
 
     def __call__(self, mixture: mpfjax.ParticleMixture) -> Step:
         """What is kept of one frame."""
-        means = mixture.component_averages(self.model.boxes(mixture.particles))[:, :2]
-        owners = mixture.component_averages(mixture.particles.reference.astype(means.dtype))
+        means = mixture.component_expectations(self.model.boxes(mixture.particles))[:, :2]
+        owners = mixture.component_expectations(mixture.particles.reference.astype(means.dtype))
         swapped = (mixture.num_components == 2) & (owners[0] > owners[-1])
         ends = jnp.stack([means[0], means[-1]])
         return Step(
@@ -241,8 +241,8 @@ def held(step: Step, truth: np.ndarray) -> np.ndarray:
     """
     gaps = np.abs(step.centres[:, :, None] - truth[None, :, :, None, :2])
     near = (gaps < np.array(REACH) * truth[None, :, :, None, 2:]).all(axis=-1)
-    own = step.target[:, :, None] == np.arange(2)[None, None, :, None]
-    shares = 2 * (near & own).mean(axis=-1)
+    is_target = step.target[:, :, None] == np.arange(2)[None, None, :, None]
+    shares = 2 * (near & is_target).mean(axis=-1)
     return (shares[:, -10:] >= 0.1).all(axis=(1, 2))
 
 
@@ -277,15 +277,15 @@ def filters_in_turns(
 
 def times_of(runs: dict[str, Callable[[int], Any]], timed: int) -> list[dict[str, Any]]:
     """Milliseconds of each run, taken in turns, and ratios to the first."""
-    taken = harness.turns(runs, timed, warm_up=WARM_UP)
-    first = next(iter(taken.values()))
+    times_by_name = harness.turns(runs, timed, warm_up=WARM_UP)
+    first = next(iter(times_by_name.values()))
     return [
         {
             "name": name, "mean": 1000 * times.mean(), "std": 1000 * times.std(),
             "median": 1000 * float(np.median(times)), "of_means": times.mean() / first.mean(),
             "of_medians": np.median(times) / np.median(first),
         }
-        for name, times in taken.items()
+        for name, times in times_by_name.items()
     ]  # fmt: skip
 
 

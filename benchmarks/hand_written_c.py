@@ -104,17 +104,17 @@ class HandWritten:
         """The means, sample sizes and increments of every run, (seeds, t, 3)."""
         return np.stack(list(self._threads.map(self._run, runs, [parts] * len(runs))))
 
-    def _run(self, given: tuple[np.ndarray, ...], parts: int) -> np.ndarray:
-        keys, shifts, arrays = given
+    def _run(self, inputs: tuple[np.ndarray, ...], parts: int) -> np.ndarray:
+        keys, shifts, arrays = inputs
         job = self._job
-        found = np.zeros((len(shifts), 3), np.float32)
+        results = np.zeros((len(shifts), 3), np.float32)
         numbers = map(ctypes.c_float, (job.sigma_x, job.sigma_y, job.low, job.high))
         self._library.run(
             *map(_address, (keys, shifts, self._observations)),
             len(shifts), self.num_particles, parts, *numbers, *map(_address, arrays),
-            _address(found),
+            _address(results),
         )  # fmt: skip
-        return found
+        return results
 
 
 def _address(array: np.ndarray) -> ctypes.c_void_p:
@@ -150,11 +150,14 @@ def compare(
     ours = through_parts(job, by_hand.num_particles)
     # The first turn compiles; what it is given says whether both agree.
     keys = [jax.random.split(jax.random.key(turn), num_seeds) for turn in range(1 + repeats)]
-    given = [by_hand.prepared(turn) for turn in range(1 + repeats)]
+    inputs = [by_hand.prepared(turn) for turn in range(1 + repeats)]
     _, sizes, log_likelihoods = ours[ALL](keys[0])
-    found = by_hand.run(given[0])
+    results = by_hand.run(inputs[0])
     reason = disagreement(
-        {"log_likelihoods": found[..., 2].sum(1), "effective_sample_sizes": found[..., 1].mean(1)},
+        {
+            "log_likelihoods": results[..., 2].sum(1),
+            "effective_sample_sizes": results[..., 1].mean(1),
+        },
         {"log_likelihoods": log_likelihoods, "effective_sample_sizes": np.mean(sizes, axis=1)},
         exact,
     )
@@ -163,7 +166,7 @@ def compare(
     runs: dict[tuple[str, int], Callable[[int], Any]] = {}
     for part, one in ours.items():
         runs["mpfjax", part] = lambda turn, one=one: one(keys[turn])
-        runs["C", part] = lambda turn, part=part: by_hand.run(given[turn], part)
+        runs["C", part] = lambda turn, part=part: by_hand.run(inputs[turn], part)
     both: Any = lambda: np.array([time.process_time(), time.perf_counter()])  # noqa: E731
     return turns(runs, repeats, clock=both)
 

@@ -74,11 +74,11 @@ def command(**quick: Any) -> Callable[[Callable[..., Any]], Callable[..., int]]:
             parser = _parser(function)
             if parser.parse_args(arguments).quick:
                 parser.set_defaults(**quick)
-            given = vars(parser.parse_args(arguments))
-            options = {name: given[name] for name in inspect.signature(function).parameters}
-            found: list[Any] = []
-            status = exit_status(lambda: found.append(function(**options)), arguments)
-            return status or int(found[0] or 0)
+            values = vars(parser.parse_args(arguments))
+            options = {name: values[name] for name in inspect.signature(function).parameters}
+            results: list[Any] = []
+            status = exit_status(lambda: results.append(function(**options)), arguments)
+            return status or int(results[0] or 0)
 
         return main
 
@@ -93,11 +93,11 @@ def _parser(function: Callable[..., Any]) -> argparse.ArgumentParser:
         formatter_class=_Help,
     )
     hints = get_type_hints(function, include_extras=True)
-    for name, given in inspect.signature(function).parameters.items():
+    for name, parameter in inspect.signature(function).parameters.items():
         if name != "quick":
-            has_flag = given.kind is inspect.Parameter.KEYWORD_ONLY
+            has_flag = parameter.kind is inspect.Parameter.KEYWORD_ONLY
             flag = f"--{name.replace('_', '-')}" if has_flag else name
-            parser.add_argument(flag, **_option(name, hints[name], given.default, function))
+            parser.add_argument(flag, **_option(name, hints[name], parameter.default, function))
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
     return parser
 
@@ -110,35 +110,35 @@ def _module_of(function: Callable[..., Any]) -> str:
 
 def _option(name: str, hint: Any, default: Any, function: Callable[..., Any]) -> dict[str, Any]:
     """What argparse is told of an option."""
-    told: dict[str, Any] = {"default": default}
+    settings: dict[str, Any] = {"default": default}
     lines = re.search(
         rf"^ *- `{name}`: (.*?)(?=\n *- `|\n\n|\Z)", function.__doc__ or "", re.S | re.M
     )
     if lines:
-        told["help"] = " ".join(lines[1].split()).replace("%", "%%")
+        settings["help"] = " ".join(lines[1].split()).replace("%", "%%")
     if type(None) in get_args(hint):
         (hint,) = (kind for kind in get_args(hint) if kind is not type(None))
     if hint is bool:
         negated = argparse.BooleanOptionalAction if default else "store_true"
-        return told | {"action": negated}
+        return settings | {"action": negated}
     metadata = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
     if "*" in metadata:
-        told["nargs"], hint = "*", get_args(hint)[0]
+        settings["nargs"], hint = "*", get_args(hint)[0]
     if "append" in metadata:
-        return told | {"action": "append", "metavar": "TEXT", "default": list(default)}
+        return settings | {"action": "append", "metavar": "TEXT", "default": list(default)}
     if get_origin(hint) in (Sequence, tuple):
         kinds = get_args(hint)
-        told.setdefault("nargs", len(kinds) if get_origin(hint) is tuple else "+")
+        settings.setdefault("nargs", len(kinds) if get_origin(hint) is tuple else "+")
         hint = kinds[0]
     if get_origin(hint) is Literal:
-        return told | {"choices": get_args(hint)}
-    told["type"] = hint
+        return settings | {"choices": get_args(hint)}
+    settings["type"] = hint
     if get_origin(hint) is Annotated:
-        told["type"], how = get_args(hint)
-        told |= {"type": how} if callable(how) else {"choices": list(how)}
-    if "choices" not in told:
-        told["metavar"] = {Path: "DIR", str: "TEXT"}.get(told["type"], "N")
-    return told
+        settings["type"], how = get_args(hint)
+        settings |= {"type": how} if callable(how) else {"choices": list(how)}
+    if "choices" not in settings:
+        settings["metavar"] = {Path: "DIR", str: "TEXT"}.get(settings["type"], "N")
+    return settings
 
 
 # --- runs -------------------------------------------------------------------------------------
@@ -163,18 +163,18 @@ def turns(
     `warm_up` turns, which compile, do not count. A run that has taken more than `budget` seconds
     in three turns sits out the others. Processor time is by `clock=time.process_time`.
     """
-    taken: dict[Any, list[float]] = {name: [] for name in runs}
+    times: dict[Any, list[float]] = {name: [] for name in runs}
     names, order = list(runs), np.random.default_rng(0)
     for turn in range(warm_up + repeats):
         for index in order.permutation(len(names)).tolist():
             name = names[index]
-            if np.sum(taken[name]) > budget and len(taken[name]) >= 3:
+            if np.sum(times[name]) > budget and len(times[name]) >= 3:
                 continue
             start = clock()
             jax.block_until_ready(runs[name](turn))
             if turn >= warm_up:
-                taken[name].append(clock() - start)
-    return {name: np.array(seconds) for name, seconds in taken.items()}
+                times[name].append(clock() - start)
+    return {name: np.array(seconds) for name, seconds in times.items()}
 
 
 def ratio(seconds: np.ndarray, of: np.ndarray) -> float:
@@ -278,11 +278,11 @@ def pivot(
 
     All three are as the columns of `table`; where there is no such entry, there is a dash.
     """
-    found: dict[str, dict[str, str]] = {}
+    by_row: dict[str, dict[str, str]] = {}
     for entry in entries:
-        found.setdefault(_cell(row, entry), {})[_cell(column, entry)] = _cell(cell, entry)
+        by_row.setdefault(_cell(row, entry), {})[_cell(column, entry)] = _cell(cell, entry)
     names = dict.fromkeys(_cell(column, entry) for entry in entries)
-    rows = [[name, *(cells.get(each, "-") for each in names)] for name, cells in found.items()]
+    rows = [[name, *(cells.get(each, "-") for each in names)] for name, cells in by_row.items()]
     return format_table([title, *names], rows)
 
 
@@ -300,8 +300,8 @@ def _cell(form: Form, entry: Mapping[str, Any]) -> str:
 
 def settings_of(options: Mapping[str, Any], **more: Any) -> dict[str, Any]:
     """What a second run needs to be the same, and the machine."""
-    given = {name: value for name, value in options.items() if name not in ("out", "resume")}
-    return given | more | {
+    settings = {name: value for name, value in options.items() if name not in ("out", "resume")}
+    return settings | more | {
         "jax": jax.__version__, "mpfjax": mpfjax.__version__, "numpy": np.__version__,
         "python": platform.python_version(), "machine": platform.machine(),
         "processors": os.cpu_count(),

@@ -46,9 +46,9 @@ def main(
     - `repeats`: turns, each of all that run.
     """
     settings = harness.settings_of(locals())
-    found = regimes(sizes, steps, seeds, reference, repeats)
-    print(harness.table(None, found))
-    harness.data(out / "marginalised.json", settings=settings, results=found)
+    rows = regimes(sizes, steps, seeds, reference, repeats)
+    print(harness.table(None, rows))
+    harness.data(out / "marginalised.json", settings=settings, results=rows)
     print(f"results: {out}/")
 
 
@@ -124,25 +124,27 @@ def regimes(
         for name, make in makes.items()
         for size in sizes
     }
-    known = np.asarray(filtered(every(reference), observations)(0))
+    answer = np.asarray(filtered(every(reference), observations)(0))
     errors = {
-        name: float(np.sqrt(np.mean([(once(s) - known) ** 2 for s in range(seeds)])))
+        name: float(np.sqrt(np.mean([(once(s) - answer) ** 2 for s in range(seeds)])))
         for name, once in runs.items()
     }
     calls = {name: lambda _, once=once: once(0) for name, once in runs.items()}
     seconds = harness.turns(calls, repeats, clock=time.process_time)
-    taken = {name: 1000 * float(np.median(times)) for name, times in seconds.items()}
+    milliseconds = {name: 1000 * float(np.median(times)) for name, times in seconds.items()}
 
     def error_at(at: float, name: str) -> float:
         """In a time: between the filter's sizes on a line of logarithms, else the end."""
-        points = sorted((np.log(taken[key]), np.log(errors[key])) for key in runs if key[0] == name)
+        points = sorted(
+            (np.log(milliseconds[key]), np.log(errors[key])) for key in runs if key[0] == name
+        )
         x, y = np.array(points).T
         return float(np.exp(np.interp(np.log(at), x, y)))
 
     return [
         {"filter": key[0], "N": key[1], "ms a run": at, "RMS error": errors[key],
          "over our best then": errors[key] / min(error_at(at, own) for own in OURS)}
-        for key, at in taken.items()
+        for key, at in milliseconds.items()
     ]  # fmt: skip
 
 

@@ -143,17 +143,17 @@ def vary(
     calls = {cell: (all_runs(cell), keys_of(cell)) for cell in cells}
     new = [cell for cell in cells if cell not in memory]
     with ThreadPoolExecutor(max_workers=2) as pool:
-        made = pool.map(lambda cell: bytes_of(compiled(*calls[cell])), new)
-        memory.update(zip(new, made, strict=True))
+        program_sizes = pool.map(lambda cell: bytes_of(compiled(*calls[cell])), new)
+        memory.update(zip(new, program_sizes, strict=True))
     runs = {cell: lambda _, call=call: call[0](call[1]) for cell, call in calls.items()}
-    taken = turns(runs, repeats, budget=BUDGET)
+    times = turns(runs, repeats, budget=BUDGET)
     entries = []
-    for cell, seconds in taken.items():
+    for cell, seconds in times.items():
         median, plain = float(np.median(seconds)), cell._replace(filter="pf", components=1)
         entry = {"axis": axis, **cell._asdict(), "seconds": seconds, "median": median}
         entries.append(entry | {"bytes": memory[cell]})
-        if plain in taken:
-            entries[-1]["ratio"] = harness.ratio(seconds, taken[plain])
+        if plain in times:
+            entries[-1]["ratio"] = harness.ratio(seconds, times[plain])
     return entries
 
 
@@ -178,8 +178,8 @@ def as_tables(axis: str, entries: list[dict[str, Any]]) -> str:
     def one(title: str, cost: str, form: Callable[[dict[str, Any]], str], last: int) -> str:
         lines = [each | {"at": f"{axis} {each[axis]}", "text": form(each)} for each in cells]
         for name in dict.fromkeys(each["filter"] for each in cells):
-            own = [each for each in cells if each["filter"] == name][-last:]
-            slope = fit_slope([each[axis] for each in own], [each[cost] for each in own])
+            rows = [each for each in cells if each["filter"] == name][-last:]
+            slope = fit_slope([each[axis] for each in rows], [each[cost] for each in rows])
             text = "-" if slope is None else f"{slope:.2f}"
             lines.append({"filter": name, "at": "slope", "text": text})
         return pivot(title, lines, lambda line: FILTERS[line["filter"]], "{at}", "{text}")

@@ -93,7 +93,7 @@ def main(
     # One cell compiles while the one before it runs; all small filters run in as many slots.
     cells = mpfjax.run_study(
         study, unfinished, resume=resume, seeds_at_once=SEEDS_AT_ONCE, cells_at_once=2,
-        slots=max(small) if len(small) > 1 else None,
+        num_slots=max(small) if len(small) > 1 else None,
     )  # fmt: skip
     results = [summarise(cell, exact_mass) for cell in cells]
     data(out / "score_vs_particles.json", settings=settings, results=results)
@@ -101,10 +101,10 @@ def main(
     typical = {
         cell["filter"]: typical_run(cell) for cell in cells if cell["num_particles"] == typical_size
     }
-    seen = np.asarray(truth), np.asarray(observations)
+    series = np.asarray(truth), np.asarray(observations)
     figures(
         out,
-        typical_run=plotting.draw_typical_run(typical, *seen, LABELS),
+        typical_run=plotting.draw_typical_run(typical, *series, LABELS),
         score_vs_particles=plotting.draw_scores(results, LABELS),
     )
     # The next run is to show what the code does then, not what it did now.
@@ -139,8 +139,8 @@ def build(
     proposal = mpfjax.GaussNewtonProposal() if name == "guided_mpf" else None
     filter = mpfjax.mixture_particle_filter(model, num_particles, proposal=proposal, **mixture)
     filter = mpfjax.with_resampling(filter, mpfjax.Resample(allocation="equal"))
-    filter = mpfjax.with_selected_start(filter, 1)
-    return mpfjax.with_point_sets(filter) if name == "guided_mpf" else filter
+    filter = mpfjax.with_initial_selection(filter, 1)
+    return mpfjax.with_quasi_monte_carlo(filter) if name == "guided_mpf" else filter
 
 
 def collect(mixture: mpfjax.ParticleMixture) -> dict[str, Array]:
@@ -151,7 +151,7 @@ def collect(mixture: mpfjax.ParticleMixture) -> dict[str, Array]:
         "component_indicators": mixture.component_indicators,
         "weight": mixture.mixture_weights[0],
         "components": jnp.sum(mixture.active.astype(jnp.int32)),
-        "mass_above": mixture.average(mixture.particles > 0),
+        "mass_above": mixture.expectation(mixture.particles > 0),
     }
 
 
@@ -160,13 +160,13 @@ def measure(
 ) -> dict[str, Array]:
     """What is kept of the runs of a cell; particles at the size of figure 1 only."""
     particles = {k: run.collected[k] for k in OF_PARTICLES}
-    kept = {k: values for k, values in run.collected.items() if k not in OF_PARTICLES}
-    kept["both"] = both_represented(particles["positions"], particles["occupied"], truth)
+    values_of = {k: values for k, values in run.collected.items() if k not in OF_PARTICLES}
+    values_of["both"] = both_represented(particles["positions"], particles["occupied"], truth)
     usable = run.final.usable_slots  # N, where there are more slots
     size = run.final.log_weights.shape[-1] if usable is None else int(usable[0])
     if size == typical_size:
-        kept |= {k: values[..., :size] for k, values in particles.items()}
-    return kept
+        values_of |= {k: values[..., :size] for k, values in particles.items()}
+    return values_of
 
 
 @jax.jit

@@ -59,21 +59,21 @@ class PropagateTempered(AbstractPropagation, AbstractWrapper):
         key_noise, *keys = jax.random.split(key, 1 + len(self.exponents))
         before, parents = mixture, mixture.particles
         noise = jax.random.normal(key_noise, (mixture.num_particles, now.model.noise_dimension))
-        mixture, below = mixture.replace(particles=self._made(noise, parents, now)), 0.0
+        mixture, below = mixture.replace(particles=self._make(noise, parents, now)), 0.0
         for stage, (key, exponent) in enumerate(zip(keys, self.exponents, strict=True)):
             if stage:
                 key_draw, key_move = jax.random.split(key)
                 mixture = self.resample.resample(key_draw, mixture)
-                mixture = self._moved(key_move, mixture, now, below)
+                mixture = self._move(key_move, mixture, now, below)
             log_likelihoods = mixture.particles.log_likelihoods
-            mixture, below = mixture.weighed((exponent - below) * log_likelihoods), exponent
+            mixture, below = mixture.reweight((exponent - below) * log_likelihoods), exponent
         return mixture.replace(particles=mixture.particles.states).with_resampled_of(before)
 
-    def _made(self, noise: Float[Array, "n d"], parents: PyTree, now: Step) -> Tempered:
+    def _make(self, noise: Float[Array, "n d"], parents: PyTree, now: Step) -> Tempered:
         states = now.law.make(noise, parents)
         return Tempered(parents, states, noise, now.law.log_likelihood(now.observation, states))
 
-    def _moved(
+    def _move(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step, exponent: float
     ) -> ParticleMixture:
         """Each particle after one Metropolis step in its noise, with the same parent."""
@@ -81,12 +81,12 @@ class PropagateTempered(AbstractPropagation, AbstractWrapper):
         key_step, key_noise, key_taken = jax.random.split(key, 3)
         step = 0.02 ** jax.random.uniform(key_step, (mixture.num_particles, 1))
         fresh = jax.random.normal(key_noise, here.noise.shape)
-        new = self._made(jnp.sqrt(1 - step**2) * here.noise + step * fresh, here.parents, now)
+        new = self._make(jnp.sqrt(1 - step**2) * here.noise + step * fresh, here.parents, now)
         log_ratio = exponent * (new.log_likelihoods - here.log_likelihoods)
-        taken = jnp.log(jax.random.uniform(key_taken, log_ratio.shape)) < log_ratio
+        is_accepted = jnp.log(jax.random.uniform(key_taken, log_ratio.shape)) < log_ratio
 
         def chosen(new: Array, old: Array) -> Array:
-            return jnp.where(taken.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+            return jnp.where(is_accepted.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
         return mixture.replace(particles=jax.tree.map(chosen, new, here))
 

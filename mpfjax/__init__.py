@@ -25,9 +25,21 @@ def _homes() -> dict[str, tuple[str, str]]:
 
 
 _HOMES = _homes()
+# Former names, which warn until the next minor version.
+_FORMER = {
+    "Targets": "TargetEstimates",
+    "keep_programs": "enable_compilation_cache",
+    "targets": "estimate_targets",
+    "with_point_sets": "with_quasi_monte_carlo",
+    "with_selected_start": "with_initial_selection",
+    "with_start": "with_initialisation",
+}
 
 
 def __getattr__(name: str) -> _Any:
+    if name in _FORMER:
+        checks = _importlib.import_module(f"{__name__}.checks")
+        return checks.of_former_name(__name__, _FORMER, name)
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, original = _HOMES[name]

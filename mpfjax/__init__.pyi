@@ -61,9 +61,9 @@ from mpfjax.moves.metropolis import RandomWalkMetropolis as RandomWalkMetropolis
 from mpfjax.moves.objects.bernoulli import Associate as Associate
 from mpfjax.moves.objects.exclusion import Exclusion as Exclusion
 from mpfjax.moves.objects.partitioned import Partitioned as Partitioned
-from mpfjax.moves.objects.tracks import Targets as Targets
+from mpfjax.moves.objects.tracks import TargetEstimates as TargetEstimates
+from mpfjax.moves.objects.tracks import estimate_targets as estimate_targets
 from mpfjax.moves.objects.tracks import number_distribution as number_distribution
-from mpfjax.moves.objects.tracks import targets as targets
 from mpfjax.moves.objects.tracks import track_table as track_table
 from mpfjax.moves.propagation.marginalised import PropagateMarginalised as PropagateMarginalised
 from mpfjax.moves.propagation.nested import PropagateNested as PropagateNested
@@ -88,7 +88,7 @@ from mpfjax.running.islands import IslandInteraction as IslandInteraction
 from mpfjax.running.islands import run_islands as run_islands
 from mpfjax.running.late import Replay as Replay
 from mpfjax.running.long_runs import Checkpoint as Checkpoint
-from mpfjax.running.programs import keep_programs as keep_programs
+from mpfjax.running.programs import enable_compilation_cache as enable_compilation_cache
 from mpfjax.running.run import monte_carlo as monte_carlo
 from mpfjax.running.run import run_filter as run_filter
 from mpfjax.running.scan import FilterRun as FilterRun
@@ -101,13 +101,13 @@ from mpfjax.smoothing.forecasts import forecast as forecast
 from mpfjax.smoothing.variance import with_eve_indices as with_eve_indices
 from mpfjax.transforms import map_moves as map_moves
 from mpfjax.transforms import with_alarm as with_alarm
+from mpfjax.transforms import with_initial_selection as with_initial_selection
+from mpfjax.transforms import with_initialisation as with_initialisation
 from mpfjax.transforms import with_lookahead as with_lookahead
-from mpfjax.transforms import with_point_sets as with_point_sets
 from mpfjax.transforms import with_proposals_per_particle as with_proposals_per_particle
+from mpfjax.transforms import with_quasi_monte_carlo as with_quasi_monte_carlo
 from mpfjax.transforms import with_resampling as with_resampling
 from mpfjax.transforms import with_restarts as with_restarts
 from mpfjax.transforms import with_score_gradient as with_score_gradient
-from mpfjax.transforms import with_selected_start as with_selected_start
-from mpfjax.transforms import with_start as with_start
 
 __version__: str

@@ -77,13 +77,13 @@ def as_numbers(
         return array
     dtype = jax.dtypes.canonicalize_dtype(array.dtype.newbyteorder("="))
     with np.errstate(over="ignore"):
-        held = array.astype(dtype)
+        result = array.astype(dtype)
     is_whole = not jnp.issubdtype(dtype, np.inexact)
-    lost = held != array if is_whole else np.isfinite(array) & ~np.isfinite(held)
+    lost = result != array if is_whole else np.isfinite(array) & ~np.isfinite(result)
     if lost.any():
         first = array[lost][0]
         raise ValueError(f"{name}: {first:g} is more than {dtype} holds; set jax_enable_x64")
-    return held
+    return result
 
 
 def _check_differences(name: str, array: Any) -> None:
@@ -211,8 +211,8 @@ class Rule:
         if not self.holds(value):
             way_out = f"write {value.__name__}(...)" if isinstance(value, type) else ""
             way_out = way_out or self.way_out(value)
-            said = f"{name}: {shown(value)} is not {self.what}"
-            raise ValueError(f"{said}; {way_out}" if way_out else said)
+            message = f"{name}: {shown(value)} is not {self.what}"
+            raise ValueError(f"{message}; {way_out}" if way_out else message)
 
 
 def number(holds: Callable[[Any], Any], what: str) -> Rule:
@@ -306,6 +306,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> R:
         try:
+            kwargs = _with_new_names(function, kwargs)
             values = _bound(function, args, kwargs)
             for name, rule in _rules(function).items():
                 if name in values:
@@ -326,11 +327,25 @@ def _bound(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict
     try:
         return signature.bind(*args, **kwargs).arguments
     except TypeError as error:
-        said = _misfit(signature, args, kwargs) or str(error)
+        message = _misfit(signature, args, kwargs) or str(error)
     who = function.__qualname__.rpartition("<locals>.")[2].removesuffix(".__init__")
-    raise TypeError(f"{who}: {said}")
+    raise TypeError(f"{who}: {message}")
 
 
+def _with_new_names(function: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
+    """The arguments, with a DeprecationWarning for one that is given by its former name."""
+    former = _FORMER_ARGUMENTS.get(function.__name__, {})
+    for old in former.keys() & kwargs.keys():
+        warn(f"{old}: this argument is now called {former[old]}", DeprecationWarning)
+    return {former.get(name, name): value for name, value in kwargs.items()}
+
+
+_FORMER_ARGUMENTS = {
+    "monte_carlo": {"slots": "num_slots"},
+    "offline_rows": {"kept": "tracks_of_frames"},
+    "run_study": {"slots": "num_slots"},
+    "sample_trajectories": {"model": "filter"},
+}
 _signature = functools.cache(inspect.signature)
 _OF_SERIES = {"inputs": "Series(y, inputs=u)", "missing": "Series.skipping(y)"}
 
@@ -340,14 +355,14 @@ def _misfit(signature: inspect.Signature, args: tuple[Any, ...], kwargs: dict[st
     parameters = [each for name, each in signature.parameters.items() if name != "self"]
     args = args["self" in signature.parameters :]
     by_place = [each.name for each in parameters if each.kind is not each.KEYWORD_ONLY]
-    names, given = [each.name for each in parameters], {*by_place[: len(args)], *kwargs}
-    free = [name for name in names if name not in given]
+    names, present = [each.name for each in parameters], {*by_place[: len(args)], *kwargs}
+    free = [name for name in names if name not in present]
     for unknown in kwargs.keys() - names:
         close = difflib.get_close_matches(unknown, free, 1)
-        said = f"did you mean {close[0]}?" if close else f"it takes {', '.join(names)}"
+        hint = f"did you mean {close[0]}?" if close else f"it takes {', '.join(names)}"
         if "observations" in names and unknown in _OF_SERIES:
-            said = f"write observations={_OF_SERIES[unknown]}"
-        return f"{unknown} is none of its arguments; {said}"
+            hint = f"write observations={_OF_SERIES[unknown]}"
+        return f"{unknown} is none of its arguments; {hint}"
     if len(args) > len(by_place):
         by_name = ", ".join(names[len(by_place) :])
         return f"{len(args)} arguments without a name; it takes {', '.join(by_place)}" + (
@@ -356,8 +371,8 @@ def _misfit(signature: inspect.Signature, args: tuple[Any, ...], kwargs: dict[st
     missing = [each.name for each in parameters if each.name in free and each.default is each.empty]
     # Without it, what follows has come in its place.
     if missing and names[0] in ("key", "keys") and not (args and is_key(args[0])):
-        made = "split(jax.random.key(0), runs)" if names[0] == "keys" else "key(0)"
-        return f"{names[0]} is missing, the first argument, as jax.random.{made}"
+        example = "split(jax.random.key(0), runs)" if names[0] == "keys" else "key(0)"
+        return f"{names[0]} is missing, the first argument, as jax.random.{example}"
     is_or_are = "is" if len(missing) == 1 else "are"
     return f"{', '.join(missing)} {is_or_are} missing" if missing else ""
 
@@ -377,9 +392,9 @@ def _rules(owner: Any) -> dict[str, Rule]:
 def hints_of(owner: Any) -> dict[str, Any]:
     is_class = isinstance(owner, type)
     # A user's subclass says by its annotations what it likes.
-    told = [base for base in owner.__mro__[::-1] if _is_ours(base)] if is_class else [owner]
+    owners = [base for base in owner.__mro__[::-1] if _is_ours(base)] if is_class else [owner]
     hints: dict[str, Any] = {}
-    for each in told:
+    for each in owners:
         hints |= inspect.get_annotations(each, eval_str=True)
     return hints
 
@@ -394,11 +409,11 @@ def _rule(hint: Any) -> Rule | None:
     if origin is Annotated:
         return next((extra for extra in choices[1:] if isinstance(extra, Rule)), None)
     if origin in (typing.Union, types.UnionType):
-        known = [rule for choice in choices if (rule := _rule(choice)) is not None]
-        if len(known) < len(choices):
+        rules = [rule for choice in choices if (rule := _rule(choice)) is not None]
+        if len(rules) < len(choices):
             return None
-        what = " or ".join(rule.what for rule in known)
-        return Rule(lambda value: any(rule.holds(value) for rule in known), what)
+        what = " or ".join(rule.what for rule in rules)
+        return Rule(lambda value: any(rule.holds(value) for rule in rules), what)
     if origin is Literal:
         return one_of(choices)
     if origin is Callable:
@@ -441,15 +456,15 @@ def _instance(kind: type) -> Rule:
 
 
 @contextlib.contextmanager
-def saying(who: str, given: str = "") -> Iterator[None]:
+def saying(who: str, clause: str = "") -> Iterator[None]:
     """Have an error of the user's own function begin with its name, what it is given, and the line.
 
-    Errors keep their type. `given` is a clause, as "given a key".
+    Errors keep their type. `clause` is a clause, as "given a key".
     """
     try:
         yield
     except Exception as error:
-        _begin(error, who, *_users_line(error)[1:], given)
+        _begin(error, who, *_users_line(error)[1:], clause)
         raise
 
 
@@ -458,16 +473,16 @@ def _begin(error: Exception, *parts: str) -> None:
     if _BEGUN in vars(error):
         return
     setattr(error, _BEGUN, True)
-    said = ", ".join(filter(None, parts)) + ": "
+    prefix = ", ".join(filter(None, parts)) + ": "
     if len(error.args) != 1 or not isinstance(error.args[0], str):
-        error.add_note(said)  # it makes its text of other things
+        error.add_note(prefix)  # it makes its text of other things
     elif isinstance(error, _OF_TRACERS):
         first, *others = error.args[0].splitlines()
         # Between them JAX prints what the number comes from, a page of its own operations.
         link = [line for line in others if "https://" in line]
-        error.args = ("\n".join([said + _UNKNOWN_NUMBERS, first, *link]),)
+        error.args = ("\n".join([prefix + _UNKNOWN_NUMBERS, first, *link]),)
     else:
-        error.args = (said + error.args[0],)
+        error.args = (prefix + error.args[0],)
 
 
 _BEGUN = "_says_where"
@@ -504,22 +519,42 @@ def _root_of(frame: types.FrameType) -> str:
     return _module_of(frame).partition(".")[0]
 
 
-def _outside(found: types.TracebackType | None) -> types.TracebackType | None:
+def _outside(traceback_: types.TracebackType | None) -> types.TracebackType | None:
     """Its frames outside of the library, and the last one, unless JAX shows its own frames."""
-    kept = None
-    for frame, line in reversed(list(traceback.walk_tb(found))):
-        is_shown = kept is None or getattr(jax.config, "jax_traceback_filtering", "") == "off"
+    result = None
+    for frame, line in reversed(list(traceback.walk_tb(traceback_))):
+        is_shown = result is None or getattr(jax.config, "jax_traceback_filtering", "") == "off"
         if is_shown or not _module_of(frame).startswith(_INNER):
-            kept = types.TracebackType(kept, frame, frame.f_lasti, line)
-    return kept
+            result = types.TracebackType(result, frame, frame.f_lasti, line)
+    return result
 
 
-def warn(said: str, category: type[Warning] = RuntimeWarning) -> None:
+def warn(message: str, category: type[Warning] = RuntimeWarning) -> None:
     """Warn at the line outside of the library from which it was called."""
-    names = [_module_of(at) for at, _ in traceback.walk_stack(sys._getframe())]
+    frames = (_module_of(at) for at, _ in traceback.walk_stack(sys._getframe()))
+    # `warnings.warn` does not count the frames of an import either.
+    names = [f"{name}." for name in frames if not name.startswith("importlib.")]
     last = max(depth for depth, name in enumerate(names) if name.startswith("mpfjax."))
     caller = next(k for k, name in enumerate(names) if k > last and not name.startswith(_INNER))
-    warnings.warn(said, category, stacklevel=caller + 1)
+    warnings.warn(message, category, stacklevel=caller + 1)
+
+
+def of_former_name(module: str, names: Mapping[str, str], name: str) -> Any:
+    """The attribute that a module now calls `names[name]`, with a DeprecationWarning."""
+    warn(f"{module}.{name} is now called {names[name]}", DeprecationWarning)
+    return getattr(sys.modules[module], names[name])
+
+
+class Renamed:
+    """An attribute of a class under its former name, with a DeprecationWarning."""
+
+    def __init__(self, old: str, new: str) -> None:
+        self.old, self.new = old, new
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        """The attribute of the new name."""
+        warn(f"{owner.__name__}.{self.old} is now called {self.new}", DeprecationWarning)
+        return getattr(owner if instance is None else instance, self.new)
 
 
 def shown(value: Any) -> str:

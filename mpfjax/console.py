@@ -76,8 +76,8 @@ def check_outputs(folder: Path, outputs: Iterable[str], inputs: dict[str, Any]) 
     for path in filter(Path.exists, (folder / output for output in outputs)):
         if not (path.is_file() and os.access(path, os.W_OK)):
             raise ValueError(f"--out: {path} is no file that can be written over")
-        for argument, given in inputs.items():
-            if given is not None and Path(given).exists() and path.samefile(given):
+        for argument, source in inputs.items():
+            if source is not None and Path(source).exists() and path.samefile(source):
                 raise ValueError(
                     f"--out: {path} is the file of {argument}, and would be overwritten"
                 )
@@ -93,7 +93,7 @@ def exit_status(run: Callable[[], None], arguments: Sequence[str] | None = ()) -
     """
     with contextlib.suppress(OSError, RuntimeError):  # the latter where there is no home
         # Imported only now: reading the arguments does not wait for JAX.
-        importlib.import_module("mpfjax.running.programs").keep_programs()
+        importlib.import_module("mpfjax.running.programs").enable_compilation_cache()
     # Tracing leaves so many objects that Python's collector takes a third of the time before a
     # first result, by going through them again and again.
     gc.set_threshold(100_000, 20, 20)

@@ -166,8 +166,10 @@ class Filter(eqx.Module):
     def _run(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree, inputs: PyTree
     ) -> tuple[ParticleMixture, StepInfo]:
-        if (given := mixture.num_components) != (own := self.num_components):
-            raise ValueError(f"mixture: num_components, {given}, is not the filter's, {own}")
+        if (number := mixture.num_components) != self.num_components:
+            raise ValueError(
+                f"mixture: num_components, {number}, is not the filter's, {self.num_components}"
+            )
         inputs = one_input(inputs, self.model)
         moved, info = _one_step(self, key, mixture, observation, inputs)
         return with_densities((moved, info), info.log_likelihood_increment)
@@ -277,8 +279,8 @@ def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> Pa
     if not isinstance(moved, ParticleMixture):
         who = f"moves: {name_of(move)} returned"
         raise ValueError(f"{who} {shown(moved)}, no ParticleMixture")
-    given = kinds((mixture.particles, mixture.log_weights, mixture.component_indicators))
-    returned = kinds((moved.particles, moved.log_weights, moved.component_indicators))
-    if returned != given:
-        raise ValueError(f"moves: {name_of(move)} returned {returned}, and was given {given}")
+    expected = kinds((mixture.particles, mixture.log_weights, mixture.component_indicators))
+    actual = kinds((moved.particles, moved.log_weights, moved.component_indicators))
+    if actual != expected:
+        raise ValueError(f"moves: {name_of(move)} returned {actual}, and was given {expected}")
     return moved

@@ -10,7 +10,7 @@ from jaxtyping import Array, PyTree
 from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead
-from mpfjax.models.base import AbstractStateSpaceModel, mapped
+from mpfjax.models.base import AbstractStateSpaceModel, over_particles
 from mpfjax.models.conditionally_linear import is_marginalised
 from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.multi_object import MultiObjectModel
@@ -31,10 +31,10 @@ from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration
 from mpfjax.moves.resampling.resample import Resample, Scheme
 from mpfjax.transforms import (
+    with_initial_selection,
     with_lookahead,
-    with_point_sets,
+    with_quasi_monte_carlo,
     with_score_gradient,
-    with_selected_start,
 )
 
 Importance = Literal["propagated", "predictive_gaussian"]
@@ -57,7 +57,7 @@ def particle_filter(
 
     Vermaak et al. (2003), section 3, with one component; a bootstrap filter unless a proposal is
     given. Use it for unimodal posteriors; when the posterior is multimodal, it eventually loses all
-    modes but one. `noise="rqmc"` is `with_point_sets`, and `gradient="stop"`, for tuning,
+    modes but one. `noise="rqmc"` is `with_quasi_monte_carlo`, and `gradient="stop"`, for tuning,
     `with_score_gradient`.
     """
     moves = [Resample(scheme, ess_threshold=ess_threshold), Propagate(proposal)]
@@ -108,7 +108,7 @@ def mixture_particle_filter(
     another. At every third step, components that overlap are merged, diffuse components are split,
     and two iterations of K-means refine the grouping, all of which is exact. If M is more than one,
     x_0 is selected by y_1 from four draws per particle (`SelectInitial`). If the prior is diffuse
-    relative to the likelihood, use `with_start`.
+    relative to the likelihood, use `with_initialisation`.
 
     - `features`, `scale`: the coordinates of a particle that the grouping moves compare, and their
       units, also for x_0 (see `KMeans`; features of one particle if the model is wrapped by
@@ -119,9 +119,9 @@ def mixture_particle_filter(
       if a `Merge` counts frames by its `patience`. The default, 3, loses nothing here;
       `gaussian_mixture_particle_filter` has 1, because a component that comes to contain two modes
       loses them at its next step.
-    - `noise`: "rqmc" is `with_point_sets`: each component has a separate point set, and the mixture
-      weights are far more accurate. It includes `with_lookahead`, unless there is a proposal or a
-      conditionally linear model.
+    - `noise`: "rqmc" is `with_quasi_monte_carlo`: each component has a separate point set, and the
+      mixture weights are far more accurate. It includes `with_lookahead`, unless there is a
+      proposal or a conditionally linear model.
     - `gradient`: "stop" is `with_score_gradient`.
 
     Use it if the posterior has several modes that must all be retained.
@@ -129,10 +129,10 @@ def mixture_particle_filter(
     plain = particle_filter(
         model, num_particles, proposal=proposal, scheme=scheme, ess_threshold=ess_threshold
     )
-    seen = _seen(model, features, scale)
-    filter = _mixture(plain, max_components, seen, _WARM_ITERATIONS, regroup, regroup_every)
+    options = _grouping_options(model, features, scale)
+    filter = _mixture(plain, max_components, options, _WARM_ITERATIONS, regroup, regroup_every)
     if max_components > 1:
-        filter = with_selected_start(filter)
+        filter = with_initial_selection(filter)
     if noise == "rqmc" and proposal is None and not is_marginalised(model):
         filter = with_lookahead(filter)
     return _with(noise, gradient, filter)
@@ -196,8 +196,8 @@ def gaussian_mixture_particle_filter(
     plain = gaussian_particle_filter(
         model, num_particles, proposal=proposal, regeneration=regeneration, importance=importance
     )
-    seen = _seen(model, features, scale)
-    return _mixture(plain, max_components, seen, _ITERATIONS, regroup, regroup_every)
+    options = _grouping_options(model, features, scale)
+    return _mixture(plain, max_components, options, _ITERATIONS, regroup, regroup_every)
 
 
 @checked
@@ -300,8 +300,8 @@ def bernoulli_filter(
 
     A particle implementation of the Poisson multi-Bernoulli filter (Williams 2015): each of
     `max_targets` components is a potential object with its own existence probability, and one more
-    component represents the intensity of undetected objects. `targets` summarises the objects.
-    `Associate` describes the algorithm and the last three arguments.
+    component represents the intensity of undetected objects. `estimate_targets` summarises the
+    objects. `Associate` describes the algorithm and the last three arguments.
 
     - `num_particles`: in total: `undetected_particles`, and a hundred or more per object.
     - `max_targets`: more than the number of measurements per scan if objects may appear anywhere.
@@ -321,13 +321,13 @@ def bernoulli_filter(
     return Filter(model, [Predict(proposal), associate], num_particles, max_targets + 1)
 
 
-def _seen(
+def _grouping_options(
     model: AbstractStateSpaceModel, features: Callable[[PyTree], Array] | None, scale: Scale
 ) -> dict[str, Any]:
-    """What the grouping moves see: by default the state, on circles where the model has periods."""
+    """The features and scale of the grouping moves: by default the state, with its periods."""
     periods = jax.tree.leaves(getattr(model, "periods", None))
     if features is not None or not periods:
-        return {"features": mapped(model, features), "scale": scale}
+        return {"features": over_particles(model, features), "scale": scale}
     flat = np.concatenate([*map(np.ravel, periods)])
     return {"features": OnCircles(tuple(flat.tolist())), "scale": scale}
 
@@ -335,25 +335,25 @@ def _seen(
 def _mixture(
     plain: Filter,
     max_components: Count,
-    seen: dict[str, Any],
+    options: dict[str, Any],
     num_iterations: int,
     regroup: Sequence[AbstractMove] | None,
     regroup_every: Count,
 ) -> Filter:
     """The filter with many components, which moves regroup; x_0 grouped by K-means from seeds."""
     if regroup is None:
-        regroup = [Merge(**seen), Split(**seen), KMeans(num_iterations, **seen)]
+        regroup = [Merge(**options), Split(**options), KMeans(num_iterations, **options)]
     regroup = as_moves(regroup, "regroup")
     if regroup and regroup_every > 1:
         regroup = (Every(regroup_every, regroup),)
     return plain.replace(
         moves=[*plain.moves, *regroup],
         num_components=max_components,
-        initial_moves=[KMeans(10, reseed=True, **seen)],
+        initial_moves=[KMeans(10, reseed=True, **options)],
     )
 
 
 def _with(noise: str, gradient: str, filter: Filter) -> Filter:
     """The filter with the two options of recipes that are transforms."""
-    filter = with_point_sets(filter) if noise == "rqmc" else filter
+    filter = with_quasi_monte_carlo(filter) if noise == "rqmc" else filter
     return with_score_gradient(filter) if gradient == "stop" else filter

@@ -17,14 +17,14 @@ class Offspring(NamedTuple):
     parents: Int[Array, " n"]
     num_drawn: Int[Array, " m"]
     due: Bool[Array, " m"]
-    kept: Int[Array, ""] | None
-    """the slot of the offspring that was to be kept; None where none was."""
+    reference: Int[Array, ""] | None
+    """the slot of the reference particle's offspring; None without a reference particle."""
 
 
 class Memory(eqx.Module):
     """An entry of a mixture's memory that follows the particles. By default it does nothing."""
 
-    def kept_slot(self) -> Int[Array, ""] | None:
+    def reference_slot(self) -> Int[Array, ""] | None:
         """The slot of a particle that has an offspring whatever is drawn."""
         return None
 
@@ -48,10 +48,10 @@ class Memory(eqx.Module):
         return ""
 
 
-def kept_slot(memory: dict[str, PyTree]) -> Int[Array, ""] | None:
-    """That of the first memory that has one."""
+def reference_slot(memory: dict[str, PyTree]) -> Int[Array, ""] | None:
+    """The slot of the reference particle in the first memory that has one."""
     for entry in memory.values():
-        if isinstance(entry, Memory) and (slot := entry.kept_slot()) is not None:
+        if isinstance(entry, Memory) and (slot := entry.reference_slot()) is not None:
             return slot
     return None
 

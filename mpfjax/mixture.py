@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int, PyTree, Shaped
 
-from mpfjax.checks import SHARES, as_numbers, checked, saying
+from mpfjax.checks import SHARES, Renamed, as_numbers, checked, saying
 from mpfjax.operations.islands import (
     excess_over_islands,
     island_index,
@@ -93,12 +93,12 @@ class ParticleMixture(eqx.Module):
     - `component_indicators`: C, shape (n,), in [0, num_components).
     - `ancestor_indices`: shape (n,), the slot of each particle's parent in the previous step's
       mixture; -1 if it has no single parent (`AbstractMove.keeps_parents`), -2 if its state was
-      restarted some steps before, by `with_start` or `with_restarts`.
+      restarted some steps before, by `with_initialisation` or `with_restarts`.
     - `num_components`: M, the maximum number of components, empty ones included; static. The
       filters of the literature call it `max_components`.
     - `memory`: quantities that moves store from step to step, by the move's name.
     - `usable_slots`: how many slots a move may fill, the first ones; None is all of them. Only
-      `monte_carlo(..., slots=...)` sets it.
+      `monte_carlo(..., num_slots=...)` sets it.
     - `t`: the number of steps; zero in a mixture of x_0. Within a step it is the number of that
       step.
     - `within`: what the moves of a step pass on to each other; None outside a step.
@@ -224,7 +224,7 @@ class ParticleMixture(eqx.Module):
         self._require_one()
         return segment_sum(_numbers(values), self.component_indicators, self.num_components)
 
-    def component_averages(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, "m *rest"]:
+    def component_expectations(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, "m *rest"]:
         """Σ_{c_i = m} w_i v_i, the weighted mean of `values` in each component, zero if empty.
 
         Integers and booleans are averaged as floating-point numbers.
@@ -236,16 +236,16 @@ class ParticleMixture(eqx.Module):
 
     def component_groups(self, groups: Int[Array, " n"]) -> Int[Array, " m"]:
         """The group of each component, where the particles of each are of one."""
-        return jnp.round(self.component_averages(groups)).astype(jnp.int32)
+        return jnp.round(self.component_expectations(groups)).astype(jnp.int32)
 
     def component_means(self) -> PyTree:
         """The weighted mean of each component: every leaf (m, ...), NaN for an empty one.
 
-        Leaves that are not floating point are averaged as in `component_averages`. For periodic
+        Leaves that are not floating point are averaged as in `component_expectations`. For periodic
         components of the state (the model's `periods`) it is the direction of the mean vector on
         the circle (Mardia and Jupp 2000), and at most half a period.
         """
-        means = _averages(self.component_averages, self.particles, self.periods)
+        means = _averages(self.component_expectations, self.particles, self.periods)
         if isinstance(means, MarginalisedState):
             within = self._component_spread(self.particles.mean)
             means = means._replace(covariance=means.covariance + within)
@@ -267,38 +267,44 @@ class ParticleMixture(eqx.Module):
         if not isinstance(self.particles, MarginalisedState):
             return covariances
         d = self.particles.mean.shape[1]
-        within = self.component_averages(self.particles.covariance)
+        within = self.component_expectations(self.particles.covariance)
         return covariances.at[:, -d:, -d:].add(within.astype(covariances.dtype))
 
     def _component_spread(
         self, values: Float[Array, "n d"], periods: Float[Array, " d"] | None = None
     ) -> Float[Array, "m d d"]:
         """The weighted covariance of the values in each component."""
-        means = _averages(self.component_averages, values, periods)
+        means = _averages(self.component_expectations, values, periods)
         centred = values - spread(means, self.component_indicators)
         if periods is not None:
             turns = jnp.round(centred / jnp.where(periods > 0, periods, jnp.inf)[None])
             centred -= periods[None] * turns
-        return self.component_averages(centred[:, :, None] * centred[:, None, :])
+        return self.component_expectations(centred[:, :, None] * centred[:, None, :])
 
     def mean(self) -> PyTree:
-        """E[x_t | y_1..y_t], leaf by leaf, over the whole mixture; see `average`.
+        """E[x_t | y_1..y_t], leaf by leaf, over the whole mixture; see `expectation`.
 
         For periodic components of the state it is the circular mean, as in `component_means`.
         """
         mass = jnp.exp(self.log_mass) if num_islands() > 1 else None
-        means = _averages(self.average, self.particles, self.periods, mass)
+        means = _averages(self.expectation, self.particles, self.periods, mass)
         if not isinstance(means, MarginalisedState):
             return means
         centred = self.particles.mean - sum_over_islands(means.mean)[None]
-        between = self.average(centred[:, :, None] * centred[:, None, :])
+        between = self.expectation(centred[:, :, None] * centred[:, None, :])
         return means._replace(covariance=means.covariance + between)
 
-    def average(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, " *rest"]:
+    average = Renamed("average", "expectation")
+    component_averages = Renamed("component_averages", "component_expectations")
+    repeated = Renamed("repeated", "repeat")
+    weighed = Renamed("weighed", "reweight")
+
+    def expectation(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, " *rest"]:
         """Σ_i exp(ℓ_i) v_i, the estimate of an expectation under the filtering distribution.
 
-        The average of the indicator of an event is its probability: `m.average(m.particles["mode"]
-        == 2)`. Integers and booleans are averaged as floating-point numbers.
+        The average of the indicator of an event is its probability:
+        `m.expectation(m.particles["mode"] == 2)`. Integers and booleans are averaged as
+        floating-point numbers.
         """
         values = _numbers(values)
         is_filled, zero = along_rows(self.occupied, values), jnp.zeros((), values.dtype)
@@ -309,14 +315,14 @@ class ParticleMixture(eqx.Module):
         return jnp.sum(jnp.where(is_filled, products, zero), axis=0)
 
     def variance(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, " *rest"]:
-        """Σ_i exp(ℓ_i) (v_i - E[v])², of each entry separately; see `average`.
+        """Σ_i exp(ℓ_i) (v_i - E[v])², of each entry separately; see `expectation`.
 
         It is computed about the mean, because E[v²] - E[v]² would be only rounding error if v is
         far from zero.
         """
         values = _numbers(values)
-        mean = sum_over_islands(self.average(values))
-        return self.average(jnp.abs(values - mean[None]) ** 2)
+        mean = sum_over_islands(self.expectation(values))
+        return self.expectation(jnp.abs(values - mean[None]) ** 2)
 
     @checked
     def quantile(
@@ -344,10 +350,10 @@ class ParticleMixture(eqx.Module):
             return column[order][jnp.maximum(places, 0)]
 
         columns = values.reshape(self.num_particles, -1)
-        found = jax.vmap(of_column, in_axes=1, out_axes=1)(columns)
-        return found.reshape(*shares.shape, *values.shape[1:])
+        quantiles = jax.vmap(of_column, in_axes=1, out_axes=1)(columns)
+        return quantiles.reshape(*shares.shape, *values.shape[1:])
 
-    def weighed(self, *log_factors: Float[Array, "#n"]) -> "ParticleMixture":
+    def reweight(self, *log_factors: Float[Array, "#n"]) -> "ParticleMixture":
         """The mixture with its weights multiplied by exp of the factors, one array or several.
 
         The largest factor of the occupied slots is moved to `log_scale`, so that a constant of any
@@ -386,12 +392,12 @@ class ParticleMixture(eqx.Module):
 
     def at_step(self) -> "ParticleMixture":
         """The mixture at the beginning of a step, each particle its own ancestor."""
-        own = jnp.arange(self.num_particles, dtype=jnp.int32)
+        indices = jnp.arange(self.num_particles, dtype=jnp.int32)
         if num_islands() > 1:
-            own += self.num_particles * island_index()
+            indices += self.num_particles * island_index()
         no_growth = jnp.zeros((), self.log_weights.dtype)
         within = Within(jnp.zeros(self.num_components, bool), no_growth)
-        return self.replace(ancestor_indices=own, t=self.t + 1, within=within, periods=None)
+        return self.replace(ancestor_indices=indices, t=self.t + 1, within=within, periods=None)
 
     @property
     def parents(self) -> PyTree:
@@ -445,7 +451,7 @@ class ParticleMixture(eqx.Module):
         """
         return self.map_slots(partial(take, indices=slots))
 
-    def repeated(self, number: int) -> "ParticleMixture":
+    def repeat(self, number: int) -> "ParticleMixture":
         """Each particle so many times, side by side, each time with its whole weight."""
         return self.map_slots(partial(jnp.repeat, repeats=number, axis=0))
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mpfjax.checks import Renamed
 from mpfjax.mixture import ParticleMixture
 
 
@@ -29,8 +30,8 @@ class StepInfo(eqx.Module):
     - `log_evidence_against_start`: log of p(y_t | x_{t-1} ~ p_0) over p(y_t | y_1..y_{t-1}): the
       evidence of y_t for a state that restarts from the prior, against the filter's hypotheses;
       None unless a move computes it, as in `with_alarm` and `with_restarts`.
-    - `surprised`: whether all hypotheses seem wrong: the cumulative sum of that evidence is above
-      5, see `FilterRun.surprised`; None as above.
+    - `alarm`: whether all hypotheses seem wrong: the cumulative sum of that evidence is above
+      5, see `FilterRun.alarm`; None as above.
     """
 
     log_likelihood_increment: Float[Array, ""]
@@ -43,7 +44,8 @@ class StepInfo(eqx.Module):
     log_marginal_likelihood_error: Float[Array, ""] | None = None
     mixture_weight_errors: Float[Array, " m"] | None = None
     log_evidence_against_start: Float[Array, ""] | None = None
-    surprised: Bool[Array, ""] | None = None
+    alarm: Bool[Array, ""] | None = None
+    surprised = Renamed("surprised", "alarm")
 
     @property
     def broken(self) -> Bool[Array, "..."]:

@@ -36,26 +36,26 @@ def map_moves(filter: Filter, change: Callable[[Any], Any]) -> Filter:
 
         map_moves(filter, lambda m: Resample("stratified") if isinstance(m, Resample) else m)
     """
-    return _mapped(filter, AbstractMove, change, within=True)
+    return _change_kind(filter, AbstractMove, change, within=True)
 
 
-def _mapped(filter: Filter, kind: Any, change: Callable[[Any], Any], within: bool) -> Filter:
+def _change_kind(filter: Filter, kind: Any, change: Callable[[Any], Any], within: bool) -> Filter:
     """The filter with its moves of this kind changed, also those within propagations or not."""
 
-    def changed(move: AbstractMove) -> Any:
+    def visit(move: AbstractMove) -> Any:
         enters = within or not isinstance(move, AbstractPropagation)
-        move = move.map_inner(changed) if enters else move
+        move = move.map_inner(visit) if enters else move
         return change(move) if isinstance(move, kind) else move
 
     return filter.replace(
-        moves=[changed(move) for move in filter.moves],
-        initial_moves=[changed(move) for move in filter.initial_moves],
+        moves=[visit(move) for move in filter.moves],
+        initial_moves=[visit(move) for move in filter.initial_moves],
     )
 
 
-def _map_kind(filter: Filter, kind: Any, change: Callable[[Any], Any]) -> Filter:
-    """The filter with changed moves of this kind, except moves inside propagations."""
-    return _mapped(filter, kind, change, within=False)
+def _change_in_chain(filter: Filter, kind: Any, change: Callable[[Any], Any]) -> Filter:
+    """The filter with its moves of this kind changed, but none within a propagation."""
+    return _change_kind(filter, kind, change, within=False)
 
 
 def _require_resample(filter: Filter, what: str) -> None:
@@ -71,11 +71,11 @@ def with_resampling(filter: Filter, resample: Resample) -> Filter:
     Raises `ValueError` for anything but a `Resample`. Use it to change the allocation of particles
     to components: `with_resampling(filter, Resample(allocation="equal"))`.
     """
-    return _map_kind(filter, Resample, lambda move: resample)
+    return _change_in_chain(filter, Resample, lambda move: resample)
 
 
 @checked
-def with_point_sets(filter: Filter) -> Filter:
+def with_quasi_monte_carlo(filter: Filter) -> Filter:
     """The filter with randomised quasi-Monte Carlo draws: sequential quasi-Monte Carlo.
 
     Gerber and Chopin (2015). All noise is "rqmc", including the noise of x_0 (see `Propagate`), and
@@ -87,7 +87,7 @@ def with_point_sets(filter: Filter) -> Filter:
     def in_order(move: Resample) -> Resample:
         return dataclasses.replace(move, sort_by=HILBERT) if move.sort_by is None else move
 
-    ordered = _map_kind(filter, Resample, in_order)
+    ordered = _change_in_chain(filter, Resample, in_order)
     return _everywhere(ordered, "noise", "rqmc").replace(initial_noise="rqmc")
 
 
@@ -120,7 +120,7 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
         plain = move.propagate if isinstance(move, PropagateNested) else move
         return plain if num_draws == 1 else PropagateNested(plain, num_draws)
 
-    return _map_kind(filter, AbstractPropagationOfEach, nested)
+    return _change_in_chain(filter, AbstractPropagationOfEach, nested)
 
 
 @checked
@@ -132,36 +132,40 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
     is a proposal also draws x_t if the filter has no other proposal. Raises `ValueError` for a
     filter without `Resample`.
     """
-    plain = _map_kind(filter, AuxiliaryResample, lambda move: move.resample)
-    look = _own_lookahead(plain) if lookahead is None else lookahead
+    plain = _change_in_chain(filter, AuxiliaryResample, lambda move: move.resample)
+    look = _lookahead_of(plain) if lookahead is None else lookahead
     _require_resample(plain, "which could look ahead")
 
     def guided(move: Propagate) -> Propagate:
         return dataclasses.replace(move, proposal=look) if move.proposal is None else move
 
-    ahead = _map_kind(plain, Resample, lambda move: AuxiliaryResample(move, look))
-    return _map_kind(ahead, Propagate, guided) if isinstance(look, AbstractProposal) else ahead
+    ahead = _change_in_chain(plain, Resample, lambda move: AuxiliaryResample(move, look))
+    return (
+        _change_in_chain(ahead, Propagate, guided) if isinstance(look, AbstractProposal) else ahead
+    )
 
 
-def _own_lookahead(filter: Filter) -> Lookahead:
+def _lookahead_of(filter: Filter) -> Lookahead:
     """The look-ahead of the proposal by which the filter draws x_t, or of the model alone."""
     proposals: list[Any] = [getattr(move, "proposal", None) for move in all_of(filter.moves)]
-    known = [proposal for proposal in proposals if hasattr(proposal, "log_normaliser")]
-    return known[0] if known else PilotLookahead()
+    lookaheads = [proposal for proposal in proposals if hasattr(proposal, "log_normaliser")]
+    return lookaheads[0] if lookaheads else PilotLookahead()
 
 
 @checked
-def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
+def with_initial_selection(filter: Filter, num_draws: Count = 4) -> Filter:
     """The filter whose x_0 is selected by y_1 from K N draws, by an initial move `SelectInitial`.
 
     `num_draws` is K; with 1, x_0 is a plain draw. The filter's propagation determines how y_1 is
     predicted. Raises `ValueError` for K < 1, and for a filter without a `Propagate` or
     `PropagateNested`. Use it if the prior is somewhat broader than the likelihood; if it is far
-    broader, use `with_start`.
+    broader, use `with_initialisation`.
     """
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
     if num_draws > 1 and any(move.at_start for move in _restarts(filter)):
-        raise ValueError("filter: its x_0 is chosen by more observations than y_1, by with_start")
+        raise ValueError(
+            "filter: its x_0 is chosen by more observations than y_1, by with_initialisation"
+        )
     if num_draws == 1:
         return filter.replace(initial_moves=others)
     select = SelectInitial(num_draws, filter.initial_noise)
@@ -169,7 +173,7 @@ def with_selected_start(filter: Filter, num_draws: Count = 4) -> Filter:
 
 
 @checked
-def with_start(filter: Filter, num_observations: Count = 8) -> Filter:
+def with_initialisation(filter: Filter, num_observations: Count = 8) -> Filter:
     """The filter whose state is redrawn at step L by a tempered sampler given y_1..y_L.
 
     Before step L the filter runs without change, and its increments are reported as zero; at step L
@@ -200,15 +204,15 @@ def with_restarts(
 
     The alarm is the one of `with_alarm`, with N draws if there is none yet. If its cumulative sum
     has been positive for L steps or more, a sample of p(x_t | the last L observations) is added to
-    the hypotheses, weighted by its evidence and p. This step takes as long as the initialisation by
-    `with_start`. A state that restarts is recovered L steps later at the earliest. `Restart`
-    describes the model for which Ẑ is unbiased. For a filter with restarts, its settings are
-    changed. Raises `ValueError` for a model that `with_start` refuses. Use it if all hypotheses may
-    be wrong: a robot that is carried away, a lost target.
+    the hypotheses, weighted by its evidence and p. This step takes as long as that of
+    `with_initialisation`. A state that restarts is recovered L steps later at the earliest.
+    `Restart` describes the model for which Ẑ is unbiased. For a filter with restarts, its settings
+    are changed. Raises `ValueError` for a model that `with_initialisation` refuses. Use it if all
+    hypotheses may be wrong: a robot that is carried away, a lost target.
 
     - `probability`: p, the probability of a restart L steps ago, when the alarm is raised.
     - `num_observations`: L: as many as distinguish the modes. It is also the number for
-      `with_start`.
+      `with_initialisation`.
     """
     alarms = [move for move in filter.moves if isinstance(move, WatchStart)]
     alarms += [move for move in _restarts(filter) if move.probability is not None]
@@ -230,7 +234,7 @@ def _restarts(filter: Filter) -> list[Restart]:
 def _with_restart(filter: Filter, **settings: Any) -> Filter:
     """The filter whose `Restart` has these settings, after the last move that does not regroup."""
     if _restarts(filter):
-        return _map_kind(filter, Restart, lambda move: dataclasses.replace(move, **settings))
+        return _change_in_chain(filter, Restart, lambda move: dataclasses.replace(move, **settings))
     place = 1 + max(t for t, move in enumerate(filter.moves) if not _regroups(move))
     grouping = [move for move in filter.initial_moves if _regroups(move)]
     restart = Restart(grouping, **settings)
@@ -246,14 +250,14 @@ def _regroups(move: AbstractMove) -> bool:
 
 @checked
 def with_alarm(filter: Filter, num_particles: Count = 4096) -> Filter:
-    """The filter that detects when all its hypotheses seem wrong: `FilterRun.surprised`.
+    """The filter that detects when all its hypotheses seem wrong: `FilterRun.alarm`.
 
     At each step the increment is compared with the evidence for a state that restarts from the
     prior. It is estimated from `num_particles` draws of x_0, the same at each step, which take as
     long as so many particles. Use it if a lost target must be noticed.
     """
     if any(move.probability is not None for move in _restarts(filter)):
-        return _map_kind(
+        return _change_in_chain(
             filter, Restart, lambda move: dataclasses.replace(move, num_particles=num_particles)
         )
     others = [move for move in filter.moves if not isinstance(move, WatchStart)]
@@ -263,9 +267,9 @@ def with_alarm(filter: Filter, num_particles: Count = 4096) -> Filter:
 def _everywhere(filter: Filter, field: str, value: str) -> Filter:
     """The filter with another value of a field in all moves that have it, also inner ones."""
 
-    def replaced(node: Any) -> Any:
+    def set_field(node: Any) -> Any:
         if not isinstance(node, AbstractMove) or field not in node.__dataclass_fields__:
             return node
         return dataclasses.replace(node, **{field: value})
 
-    return map_moves(filter, replaced)
+    return map_moves(filter, set_field)

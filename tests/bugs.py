@@ -33,8 +33,8 @@ class Bug(NamedTuple):
 BUGS = {
     "an object that was missed stays as probable": Bug(
         "moves/objects/bernoulli.py",
-        "masses = seen + unseen * before.of_owners(1 / rows, 1)",
-        "masses = seen + unseen",
+        "masses = detected_masses + unseen * before.of_owners(1 / rows, 1)",
+        "masses = detected_masses + unseen",
         "tests/moves/test_bernoulli.py -k sensors_in_turn",
     ),
     "the proposal's density has the wrong sign": Bug(
@@ -95,8 +95,8 @@ BUGS = {
     ),
     "a look-ahead is not divided out again": Bug(
         "moves/resampling/auxiliary.py",
-        "drawn = drawn.weighed(-take(log_factors, ancestors.particles))",
-        "drawn = drawn.weighed(0 * take(log_factors, ancestors.particles))",
+        "result = result.reweight(-take(log_factors, ancestors.particles))",
+        "result = result.reweight(0 * take(log_factors, ancestors.particles))",
         "tests/moves/test_auxiliary.py -k expected",
     ),
     "Gauss-Newton's volume is inverted": Bug(
@@ -114,14 +114,14 @@ BUGS = {
     # vision and metrics
     "OSPA's cutoff cuts at twice of it": Bug(
         "metrics/set_distances.py",
-        "np.minimum(cdist(found, there) / cutoff, 1.0)",
-        "np.minimum(cdist(found, there) / cutoff, 2.0)",
+        "np.minimum(cdist(estimates, truths) / cutoff, 1.0)",
+        "np.minimum(cdist(estimates, truths) / cutoff, 2.0)",
         "tests/metrics/test_set_distances.py -k ospa",
     ),
     "objects move against the camera": Bug(
         "vision/tracking/step.py",
-        "objects = state.objects.shifted(shift)",
-        "objects = state.objects.shifted(-shift)",
+        "objects = state.objects.shift(shift)",
+        "objects = state.objects.shift(-shift)",
         "tests/vision/test_tracker.py -k shaking",
     ),
     # Propagation, several objects, look-aheads.
@@ -133,7 +133,7 @@ BUGS = {
     ),
     "restarts forget the evidence of the old hypotheses": Bug(
         "moves/start/restart.py",
-        "log_odds = jnp.sum(sample.log_increments - known)",
+        "log_odds = jnp.sum(sample.log_increments - old_increments)",
         "log_odds = jnp.sum(sample.log_increments)",
         "tests/moves/start/test_restart.py -k evidence_and",
     ),

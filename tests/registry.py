@@ -148,7 +148,7 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         "guided mpf rqmc, adaptive": _mpf(
             m, proposal=GaussNewtonProposal(), noise="rqmc", ess_threshold=0.5
         ),
-        "gaussian mixture rqmc": lambda model: mpfjax.with_point_sets(
+        "gaussian mixture rqmc": lambda model: mpfjax.with_quasi_monte_carlo(
             mpfjax.gaussian_mixture_particle_filter(model, NUM_PARTICLES, m)
         ),
         "guided mpf": _mpf(m, proposal=GaussNewtonProposal()),
@@ -190,7 +190,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "pf stratified": _pf(scheme="stratified"),
     "pf rqmc": _pf(noise="rqmc"),
     "pf rqmc of many initial draws": lambda model: mpfjax.with_proposals_per_particle(
-        mpfjax.with_selected_start(_pf(noise="rqmc")(model), 3), 2
+        mpfjax.with_initial_selection(_pf(noise="rqmc")(model), 3), 2
     ),
     "auxiliary pf, adaptive": lambda model: mpfjax.with_lookahead(
         _pf(ess_threshold=0.5)(model), GaussNewtonProposal()

@@ -48,7 +48,7 @@ def truth() -> Truth:
 def regimes(mixture):
     """The probability of each regime."""
     latent = mixture.particles.latent
-    return jnp.stack([mixture.average(latent == k) for k in range(NUM_REGIMES)])
+    return jnp.stack([mixture.expectation(latent == k) for k in range(NUM_REGIMES)])
 
 
 def moments(mixture):

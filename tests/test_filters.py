@@ -177,9 +177,9 @@ def test_slots_are_one_program_whatever_the_number_of_particles():
     def evidence(num_particles):
         model = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
         filter = mpfjax.mixture_particle_filter(model, num_particles, 2)
-        filter = mpfjax.with_selected_start(filter, 1)
+        filter = mpfjax.with_initial_selection(filter, 1)
         keys = jax.random.split(KEY, 3)
-        run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean, slots=61)
+        run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean, num_slots=61)
         return run.log_marginal_likelihood
 
     evidence(20)
@@ -329,7 +329,7 @@ def test_mixtures_know_the_periods_of_their_model(tmp_path):
     for run in runs:
         assert all(abs(each.mean()) > 2.8 for each in (run.initial, run.final))
     keys = jax.random.split(KEY, 2)
-    runs.append(mpfjax.monte_carlo(keys, plain, series, mean, slots=64))
+    runs.append(mpfjax.monte_carlo(keys, plain, series, mean, num_slots=64))
     # An island's part of the mean is a sum, and that of the whole mixture their sum.
     collected = [run.collected for run in runs]
     collected[2] = collected[2].sum(axis=1)

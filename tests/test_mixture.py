@@ -130,7 +130,7 @@ def test_states_that_are_not_floats_are_averaged_as_numbers():
             expected = np.einsum("i,i...->...", within[slots], values[slots])
             expected = expected if slots.size else np.full_like(expected, np.nan)
             np.testing.assert_allclose(by_component[name][m], expected, rtol=1e-5, atol=1e-6)
-    found = mixture.average(mixture.particles["mode"] == 2)
+    found = mixture.expectation(mixture.particles["mode"] == 2)
     assert float(found) == pytest.approx(weights[states["mode"] == 2].sum(), rel=1e-5)
     flat = np.column_stack([states["mode"], states["position"], states["seen"]]).astype(float)
     slots = members(mixture)[0]
@@ -162,5 +162,7 @@ def test_a_variance_is_about_the_mean():
     mean = np.exp(log_weights) @ places.astype(float)
     expected = np.exp(log_weights) @ (places - mean) ** 2
     np.testing.assert_allclose(mixture.variance(mixture.particles), expected, rtol=1e-4)
-    seconds = mixture.average(mixture.particles**2) - mixture.average(mixture.particles) ** 2
+    seconds = (
+        mixture.expectation(mixture.particles**2) - mixture.expectation(mixture.particles) ** 2
+    )
     assert np.abs(seconds / expected - 1).max() > 0.01

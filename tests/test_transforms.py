@@ -15,12 +15,12 @@ from mpfjax import (
     Propagate,
     PropagateNested,
     Resample,
+    with_initial_selection,
     with_lookahead,
-    with_point_sets,
     with_proposals_per_particle,
+    with_quasi_monte_carlo,
     with_resampling,
     with_score_gradient,
-    with_selected_start,
 )
 from mpfjax.lookahead.pilot import PilotLookahead
 from mpfjax.moves.initial import SelectInitial
@@ -44,7 +44,7 @@ def final(filter):
 def test_the_keywords_of_recipes_are_transforms():
     plain = mpfjax.particle_filter(MODEL, 32)
     for keywords, transform in (
-        ({"noise": "rqmc"}, with_point_sets),
+        ({"noise": "rqmc"}, with_quasi_monte_carlo),
         ({"gradient": "stop"}, with_score_gradient),
     ):
         recipe = mpfjax.particle_filter(MODEL, 32, **keywords)
@@ -55,9 +55,9 @@ def test_the_keywords_of_recipes_are_transforms():
 def test_they_compose_on_a_chain_of_ones_own():
     filter = own_chain()
     for change in (
-        with_point_sets,
+        with_quasi_monte_carlo,
         with_score_gradient,
-        lambda f: with_selected_start(f, 3),
+        lambda f: with_initial_selection(f, 3),
         lambda f: with_resampling(f, Resample("stratified")),
     ):
         filter = change(filter)
@@ -78,10 +78,10 @@ def test_the_score_gradient_reaches_the_resampling_inside_of_moves():
 
 
 def test_point_sets_sort_the_chains_own_resampling_alone():
-    filter = with_point_sets(mpfjax.auxiliary_particle_filter(MODEL, 16, PilotLookahead()))
+    filter = with_quasi_monte_carlo(mpfjax.auxiliary_particle_filter(MODEL, 16, PilotLookahead()))
     assert filter.moves[0].resample.sort_by == "hilbert"
     own = Resample(sort_by=lambda states: -states)
-    kept = with_point_sets(with_resampling(mpfjax.particle_filter(MODEL, 16), own))
+    kept = with_quasi_monte_carlo(with_resampling(mpfjax.particle_filter(MODEL, 16), own))
     assert kept.moves[0].sort_by is own.sort_by
 
 
@@ -99,13 +99,13 @@ def test_a_look_ahead_and_proposals_are_put_on_and_taken_off():
     assert isinstance(several.moves[1], PropagateNested)
     assert with_proposals_per_particle(several, 8).moves[1].num_draws == 8
     assert isinstance(with_proposals_per_particle(several, 1).moves[1], Propagate)
-    chex.assert_trees_all_equal(final(with_selected_start(plain, 1)), final(plain))
+    chex.assert_trees_all_equal(final(with_initial_selection(plain, 1)), final(plain))
 
 
 @pytest.mark.exactness
 def test_a_filter_is_replaced_by_its_own_arguments():
     other = mpfjax.QuadraticModel(0.1, 0.5, -2.0, 2.0)
-    filter = with_selected_start(own_chain(), 3)
+    filter = with_initial_selection(own_chain(), 3)
     changed = filter.replace(model=other, num_particles=50)
     assert changed.num_particles == 50
     assert changed.model is other

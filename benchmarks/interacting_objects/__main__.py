@@ -92,8 +92,8 @@ def run_all(
         repulsion = mpfjax.PairwiseRepulsion(REPULSION, BOX, made.place_of)
         model = mpfjax.MultiObjectModel(blobs, num_objects, repulsion, per_object=True)
         filter = make(model, num_particles) if order is None else make(model, num_particles, order)
-        seen = jax.tree.map(lambda leaf: leaf[1:], scene.seen)
-        return mpfjax.run_filter(key, filter, seen, median).collected
+        measurements = jax.tree.map(lambda leaf: leaf[1:], scene.seen)
+        return mpfjax.run_filter(key, filter, measurements, median).collected
 
     return jax.lax.map(run, (keys, scenes, orders), batch_size=runs_at_once)
 
@@ -123,8 +123,8 @@ def run_method(method: str, setting: made.Setting, num_runs: int, seed: int) -> 
     # What a cluster filter need not do it skips, but not for many runs side by side.
     runs_at_once = None if method in ONE_BY_ONE else RUNS_AT_ONCE
     make = METHODS[method][1]
-    found = run_all(make, setting.num_particles, keys, scenes, orders, runs_at_once)
-    tracked = track_state(boxes(found), boxes(scenes.places[:, 1:]))
+    medians = run_all(make, setting.num_particles, keys, scenes, orders, runs_at_once)
+    tracked = track_state(boxes(medians), boxes(scenes.places[:, 1:]))
     return np.asarray(tracked).reshape(num_orders, num_runs, NUM_FRAMES - 1, setting.num_objects)
 
 
@@ -155,10 +155,10 @@ def draw(results: list[dict[str, Any]]) -> Any:
     """A panel for each scene: every method's rate and interval."""
 
     def panel(scene: str) -> plotting.Panel:
-        own = [line for line in results if line["scene"] == scene]
+        lines_of_scene = [line for line in results if line["scene"] == scene]
         ends = (lambda line, i=i: line["interval"][i] for i in (0, 1))
         label = "share of {runs} scenes, with its 95% interval".format_map
-        lines = plotting.lines_of(own, label, "label", "rate", *ends)
+        lines = plotting.lines_of(lines_of_scene, label, "label", "rate", *ends)
         return plotting.Panel(
             f"{scene}: {SCENES[scene].title}", "recovery", "", lines, (-0.05, 1.05)
         )

@@ -41,13 +41,13 @@ class ProposeInPartitions(mpfjax.AbstractPropagation):
         num_draws = self.num_draws or 1
         keys = jax.random.split(key, 3 * model.num_objects).reshape(3, -1)
         objects = jnp.arange(model.num_objects, dtype=jnp.int32)
-        seen = model.prepare_observation(now.observation)
+        observation = model.prepare_observation(now.observation)
         # The K points of a row stand side by side.
         repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_draws, axis=0), mixture.particles)
 
         def draw(key: Key[Array, ""], states: PyTree, j: Int[Array, ""]) -> tuple:
             points = model.sample_object_transition(key, states, j)
-            log_likelihoods = model.object_log_likelihood(seen, points, j)
+            log_likelihoods = model.object_log_likelihood(observation, points, j)
             return points, log_likelihoods.reshape(-1, num_draws)
 
         points, tables = jax.vmap(draw, in_axes=(0, 1, 0), out_axes=(1, 0))(
@@ -68,7 +68,7 @@ class ProposeInPartitions(mpfjax.AbstractPropagation):
         for i, j in _pairs(model):
             states = _states_of(particles, i, j)
             log_factors += model.interaction(*states)
-        return mixture.replace(particles=particles).weighed(log_factors)
+        return mixture.replace(particles=particles).reweight(log_factors)
 
 
 def _pairs(model: mpfjax.MultiObjectModel) -> list[tuple[int, int]]:
@@ -84,7 +84,7 @@ def _near(model: mpfjax.MultiObjectModel, points: PyTree) -> Bool[Array, " objec
         states, others = _states_of(points, i, j)
 
         def meets(state: PyTree, others: PyTree = others) -> Bool[Array, ""]:
-            repeat = lambda own, other: jnp.broadcast_to(own[None], other.shape)  # noqa: E731
+            repeat = lambda one, other: jnp.broadcast_to(one[None], other.shape)  # noqa: E731
             states = jax.tree.map(repeat, state, others)
             return jnp.any(model.interaction(states, others) != 0)  # pyright: ignore
 

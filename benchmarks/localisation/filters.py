@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, Key
 import mpfjax
 from benchmarks.peers.libraries import blackjax_steps
 from mpfjax import robots
-from mpfjax.models.base import replaced
+from mpfjax.models.base import replace_fields
 
 PEER = "blackjax, bootstrap filter"
 
@@ -96,7 +96,7 @@ def as_amcl(model: Any) -> Any:
         laser.angles, laser_max_range=laser.laser_max_range, z_hit=laser.z_hit,
         z_rand=laser.z_rand, sigma_hit=laser.sigma_hit, weighting="cubes",
     )  # fmt: skip
-    return replaced(model, sensor=field)
+    return replace_fields(model, sensor=field)
 
 
 def replace_some(
@@ -123,11 +123,13 @@ FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
     "AMCL": lambda model, n, m: mpfjax.Filter(as_amcl(model), [AdaptiveMonteCarlo()], 5000),
     "mixture": mixture,
     "mixture, with_restarts": lambda model, n, m: mpfjax.with_restarts(mixture(model, n, m)),
-    "mixture, with_start": lambda model, n, m: mpfjax.with_start(mixture(model, n, m)),
-    "the same, with_restarts": lambda model, n, m: mpfjax.with_restarts(
-        mpfjax.with_start(mixture(model, n, m))
+    "mixture, with_initialisation": lambda model, n, m: mpfjax.with_initialisation(
+        mixture(model, n, m)
     ),
-    "with_start, equal slots": lambda model, n, m: mpfjax.with_start(
+    "the same, with_restarts": lambda model, n, m: mpfjax.with_restarts(
+        mpfjax.with_initialisation(mixture(model, n, m))
+    ),
+    "with_initialisation, equal slots": lambda model, n, m: mpfjax.with_initialisation(
         mpfjax.with_resampling(mixture(model, n, m), mpfjax.Resample(allocation="equal"))
     ),
 }

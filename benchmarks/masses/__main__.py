@@ -73,20 +73,22 @@ def main(
     for name in scenes:
         make, num_steps = SCENES[name]
         scene = make(steps or num_steps, seed)
-        known = truth(scene, reference, seed + 1)
-        truths[name] = known._asdict()
-        own = []
+        answer = truth(scene, reference, seed + 1)
+        truths[name] = answer._asdict()
+        scene_rows = []
         for size in particles:
-            made = {each: FILTERS[each](scene, size) for each in filters}
-            for row in measure(scene, known, made, seeds, seed if keys is None else keys):
-                own.append({"scene": name, "N": size, **row})
-            harness.data(out / "masses.json", settings=settings, truth=truths, rows=rows + own)
-        rows += own
-        masses = ", ".join(f"{mass:.3f}" for mass in known.masses)
-        sure = f"known to within {known.standard_errors.max():.4f}; log Z {known.log_z:.2f}"
-        print(f"\n{name}: masses {masses}, {sure} ± {known.log_z_error:.2f}")
-        own.sort(key=lambda row: row["N"])
-        print(harness.table(COLUMNS, own))
+            by_name = {each: FILTERS[each](scene, size) for each in filters}
+            for row in measure(scene, answer, by_name, seeds, seed if keys is None else keys):
+                scene_rows.append({"scene": name, "N": size, **row})
+            harness.data(
+                out / "masses.json", settings=settings, truth=truths, rows=rows + scene_rows
+            )
+        rows += scene_rows
+        masses = ", ".join(f"{mass:.3f}" for mass in answer.masses)
+        sure = f"known to within {answer.standard_errors.max():.4f}; log Z {answer.log_z:.2f}"
+        print(f"\n{name}: masses {masses}, {sure} ± {answer.log_z_error:.2f}")
+        scene_rows.sort(key=lambda row: row["N"])
+        print(harness.table(COLUMNS, scene_rows))
         # Programs keep memory maps, of which a process has 65 530, and no other scene needs these.
         jax.clear_caches()
     harness.figures(out, dpi=130, masses=picture(rows))
@@ -133,7 +135,7 @@ def truth(scene: Scene, num_particles: int, seed: int) -> Known:
 
 
 def measure(
-    scene: Scene, known: Known, filters: Mapping[Any, mpfjax.Filter], seeds: int, seed: int
+    scene: Scene, answer: Known, filters: Mapping[Any, mpfjax.Filter], seeds: int, seed: int
 ) -> list[dict[str, Any]]:
     """Errors and time of each filter, and how much worse it is than the first one."""
     observations, key = jnp.asarray(scene.observations), jax.random.key(seed)
@@ -149,11 +151,11 @@ def measure(
     }
     rows, first = [], {}
     for name, filter in filters.items():
-        found = results(scene, filter, seeds, seed)
-        own = losses(found, known, scene.truth)
-        row = {"filter": name, **summary(found, own, scene.truth), "ms": times[name]}
-        row |= {f"{what}_worse": harness.worse(own[what], first[what]) for what in first}
-        rows, first = [*rows, row], first or own
+        result = results(scene, filter, seeds, seed)
+        errors = losses(result, answer, scene.truth)
+        row = {"filter": name, **summary(result, errors, scene.truth), "ms": times[name]}
+        row |= {f"{what}_worse": harness.worse(errors[what], first[what]) for what in first}
+        rows, first = [*rows, row], first or errors
     return rows
 
 
@@ -165,29 +167,29 @@ def results(scene: Scene, filter: mpfjax.Filter, seeds: int, seed: int) -> Found
     return Found(np.asarray(masses), np.asarray(run.log_marginal_likelihood))
 
 
-def losses(found: Found, known: Known, region: int) -> dict[str, np.ndarray]:
+def losses(result: Found, answer: Known, region: int) -> dict[str, np.ndarray]:
     """Of each run: squared errors of the masses and of log Ẑ, and whether the mode is lost."""
     return {
-        "masses": np.mean((found.masses - known.masses) ** 2, axis=1),
-        "log_z": (found.log_z - known.log_z) ** 2,
-        "lost": (found.masses[:, region] < LOST).astype(float),
+        "masses": np.mean((result.masses - answer.masses) ** 2, axis=1),
+        "log_z": (result.log_z - answer.log_z) ** 2,
+        "lost": (result.masses[:, region] < LOST).astype(float),
     }
 
 
-def summary(found: Found, own: dict[str, np.ndarray], region: int) -> dict[str, float]:
+def summary(result: Found, errors: dict[str, np.ndarray], region: int) -> dict[str, float]:
     """Errors of the masses and of log Ẑ, with standard errors.
 
     `lost` is the share of runs that leave the true `region` less than a hundredth of the mass.
     """
-    rmse, rmse_error = harness.rms_and_error(own["masses"])
-    log_rmse, log_rmse_error = harness.rms_and_error(own["log_z"])
-    lost, runs, deviation = own["lost"].mean(), len(own["lost"]), found.log_z.std(ddof=1)
+    rmse, rmse_error = harness.rms_and_error(errors["masses"])
+    log_rmse, log_rmse_error = harness.rms_and_error(errors["log_z"])
+    lost, runs, deviation = errors["lost"].mean(), len(errors["lost"]), result.log_z.std(ddof=1)
     return {
-        "mass_of_truth": float(found.masses[:, region].mean()),
+        "mass_of_truth": float(result.masses[:, region].mean()),
         "lost": float(lost), "lost_error": float(np.sqrt(lost * (1 - lost) / runs)),
         "log_z_rmse": log_rmse, "log_z_rmse_error": log_rmse_error,
         "mass_rmse": rmse, "mass_rmse_error": rmse_error,
-        "largest_mass": float(np.median(found.masses.max(axis=1))),
+        "largest_mass": float(np.median(result.masses.max(axis=1))),
         "log_z_sd": float(deviation),
         "log_z_sd_error": float(deviation / np.sqrt(2 * (runs - 1))),
     }  # fmt: skip
@@ -197,9 +199,9 @@ def picture(rows: list[dict[str, Any]]) -> Any:
     """For each scene the errors of the masses, and of log Ẑ below."""
 
     def panel(scene: str, what: str, label: str) -> plotting.Panel:
-        own = [row for row in rows if row["scene"] == scene]
+        scene_rows = [row for row in rows if row["scene"] == scene]
         ends = (lambda row, k=k: row[what] + k * row[what + "_error"] for k in (-2, 2))
-        lines = plotting.lines_of(own, "N = {N}, ± 2 s.e.".format_map, "filter", what, *ends)
+        lines = plotting.lines_of(scene_rows, "N = {N}, ± 2 s.e.".format_map, "filter", what, *ends)
         return plotting.Panel(scene, label, "", lines, (0, None))
 
     measures = {"mass_rmse": "RMSE of the masses", "log_z_rmse": r"RMSE of $\log \hat{Z}$"}

@@ -25,12 +25,12 @@ def _mixture(**options: Any) -> Make:
     )
 
 
-def _changed(make: Make, change: Callable[[mpfjax.Filter], mpfjax.Filter]) -> Make:
+def _change(make: Make, change: Callable[[mpfjax.Filter], mpfjax.Filter]) -> Make:
     """The filters of another row after a change."""
     return lambda scene, num_particles: change(make(scene, num_particles))
 
 
-def _learned(scene: Scene, num_particles: int) -> mpfjax.Filter:
+def _learn(scene: Scene, num_particles: int) -> mpfjax.Filter:
     """The mixture filter, which knows the whole series from five earlier runs."""
     plain = _mixture()(scene, num_particles)
     return learn_lookahead(jax.random.key(0), plain, scene.observations, features=scene.features)
@@ -43,10 +43,10 @@ FILTERS: dict[str, Make] = {
     "PF": _plain(),
     "PF, rqmc": _plain(noise="rqmc"),
     "MPF": _mixture(),
-    "MPF, equal slots": _changed(_mixture(), _EQUAL_SLOTS),
+    "MPF, equal slots": _change(_mixture(), _EQUAL_SLOTS),
     "MPF, rqmc": _mixture(noise="rqmc"),
-    "MPF, rqmc, no look-ahead": _changed(_mixture(), mpfjax.with_point_sets),
-    "MPF, 4 draws": _changed(_mixture(), _FOUR_DRAWS),
-    "MPF, rqmc, 4 draws": _changed(_mixture(noise="rqmc"), _FOUR_DRAWS),
-    "MPF, learned look-ahead": _learned,
+    "MPF, rqmc, no look-ahead": _change(_mixture(), mpfjax.with_quasi_monte_carlo),
+    "MPF, 4 draws": _change(_mixture(), _FOUR_DRAWS),
+    "MPF, rqmc, 4 draws": _change(_mixture(noise="rqmc"), _FOUR_DRAWS),
+    "MPF, learned look-ahead": _learn,
 }

@@ -70,13 +70,13 @@ class Corridor(mpfjax.AbstractStateSpaceModel):
         offsets = states - self.spacing * jnp.round(states / self.spacing)
         return self.niche_depth * jnp.exp(-0.5 * (offsets / self.niche_width) ** 2)
 
-    def simulated(self, num_steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    def simulate(self, num_steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """A path (t,) and what is seen along it (t,)."""
         rng = np.random.default_rng(seed)
         steps = self.speed + self.slip * rng.normal(size=num_steps)
         path = self.num_doors * self.spacing * rng.random() + np.cumsum(steps)
-        seen = np.asarray(self.distance(jnp.asarray(path)))
-        observations = seen + self.sensor_error * rng.normal(size=num_steps)
+        readings = np.asarray(self.distance(jnp.asarray(path)))
+        observations = readings + self.sensor_error * rng.normal(size=num_steps)
         return path.astype(np.float32), observations.astype(np.float32)
 
     def section(self, states: Float[Array, " n"], place: Float[Array, ""]) -> Int[Array, " n"]:
@@ -131,14 +131,14 @@ class Jumps(_FromNoise):
         """log N(y_t; |x_t|, sensor_error²)."""
         return _log_normal(observation - jnp.abs(states), self.sensor_error)
 
-    def simulated(self, num_steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    def simulate(self, num_steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """A path (t,) and the distances that are seen along it (t,)."""
         rng = np.random.default_rng(seed)
         is_long = rng.random(num_steps) < self.jump_probability
         steps = np.where(is_long, self.jump, self.step) * rng.normal(size=num_steps)
         path = self.centre + self.spread * rng.normal() + np.cumsum(steps)
-        seen = np.abs(path) + self.sensor_error * rng.normal(size=num_steps)
-        return path.astype(np.float32), seen.astype(np.float32)
+        readings = np.abs(path) + self.sensor_error * rng.normal(size=num_steps)
+        return path.astype(np.float32), readings.astype(np.float32)
 
 
 # --- a target whose distances to two posts are measured -------------------------------------------
@@ -183,17 +183,17 @@ class Mirror(_FromNoise):
         offsets = states[:, None, :2] - self.posts[None]
         return jnp.sqrt(jnp.sum(offsets**2, axis=2))
 
-    def simulated(self, num_steps: int, seed: int) -> np.ndarray:
+    def simulate(self, num_steps: int, seed: int) -> np.ndarray:
         """The distances (t, 2) that are measured of a target on the upper side."""
         rng = np.random.default_rng(seed)
-        states, seen = jnp.array([[3.0, 5.0, 0.15, -0.05]], jnp.float32), []
+        states, readings = jnp.array([[3.0, 5.0, 0.15, -0.05]], jnp.float32), []
         for _ in range(num_steps):
             noise = jnp.asarray(rng.normal(size=(1, 2)), jnp.float32)
             states = self.transition_from_noise(noise, states)
-            seen.append(
+            readings.append(
                 np.asarray(self.distances(states))[0] + self.sensor_error * rng.normal(size=2)
             )
-        return np.array(seen, np.float32)
+        return np.array(readings, np.float32)
 
 
 # --- a manoeuvring target, seen by hydrophones that cannot tell left from right -------------------
@@ -227,7 +227,7 @@ def _log_of_angles(observation: Float[Array, "2"], motion: Float[Array, "n d"]) 
     return -0.5 * jnp.sum(errors**2, axis=0) - 2 * jnp.log(_NOISE * jnp.sqrt(2 * jnp.pi))
 
 
-def _moved(
+def _move(
     motion: Float[Array, "n 4"], mode: Array, pushed: Float[Array, "n 2"]
 ) -> Float[Array, "n 4"]:
     """A step on: the velocity turned by the mode's angle and pushed, the position half-way."""
@@ -266,7 +266,7 @@ class Bearings(_FromNoise):
         """Two accelerations and a mode from three standard normal numbers."""
         mode = _drawn_mode(noise[:, 2], states["mode"])
         return {
-            "motion": _moved(states["motion"], mode, _ACCELERATION * noise[:, :2]),
+            "motion": _move(states["motion"], mode, _ACCELERATION * noise[:, :2]),
             "mode": mode,
         }
 
@@ -274,16 +274,16 @@ class Bearings(_FromNoise):
         """Of two angles."""
         return _log_of_angles(observation, states["motion"])
 
-    def simulated(self, num_steps: int, seed: int) -> np.ndarray:
+    def simulate(self, num_steps: int, seed: int) -> np.ndarray:
         """What is heard of a target that goes straight on, turns, and goes on."""
         rng = np.random.default_rng(seed)
-        motion, found = jnp.array([[3.0, 4.0, 0.12, -0.03]], jnp.float32), []
+        motion, readings = jnp.array([[3.0, 4.0, 0.12, -0.03]], jnp.float32), []
         for step in range(num_steps):
             turning = num_steps // 3 <= step < num_steps // 2
             pushed = jnp.asarray(_ACCELERATION * rng.normal(size=(1, 2)), jnp.float32)
-            motion = _moved(motion, jnp.asarray([2 if turning else 0]), pushed)
-            found.append(np.asarray(_heard(motion))[:, 0] + _NOISE * rng.normal(size=2))
-        return np.array(found, np.float32)
+            motion = _move(motion, jnp.asarray([2 if turning else 0]), pushed)
+            readings.append(np.asarray(_heard(motion))[:, 0] + _NOISE * rng.normal(size=2))
+        return np.array(readings, np.float32)
 
 
 def motion_and_turn(states: PyTree) -> Float[Array, "n 5"]:
@@ -353,12 +353,12 @@ class Terrain(mpfjax.AbstractStateSpaceModel):
         angles = states @ self.waves.T + self.phases[None]
         return jnp.sin(angles) @ self.amplitudes
 
-    def simulated(self, num_steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    def simulate(self, num_steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """A path (t, 2) and the heights that are seen along it (t,)."""
         rng = np.random.default_rng(seed)
         steps = np.asarray(self.velocity) + self.drift * rng.normal(size=(num_steps, 2))
         path = self.side * rng.uniform(0.3, 0.7, size=2) + np.cumsum(steps, axis=0)
         path = path.astype(np.float32)
         heights = np.asarray(self.height(jnp.asarray(path)))
-        seen = heights + self.sensor_error * rng.normal(size=num_steps)
-        return path, seen.astype(np.float32)
+        readings = heights + self.sensor_error * rng.normal(size=num_steps)
+        return path, readings.astype(np.float32)

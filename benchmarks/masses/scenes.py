@@ -40,7 +40,7 @@ class Scene(NamedTuple):
 
     def masses(self, mixture: mpfjax.ParticleMixture) -> Array:
         """The mass of each region."""
-        return mixture.average(jax.nn.one_hot(self.region(mixture.particles), self.num_regions))
+        return mixture.expectation(jax.nn.one_hot(self.region(mixture.particles), self.num_regions))
 
 
 def by_sign(states: Array) -> Array:
@@ -50,15 +50,15 @@ def by_sign(states: Array) -> Array:
 
 def of_grid(model: Any, observations: np.ndarray, grid: Array) -> tuple[np.ndarray, float]:
     """The exact masses of the two sides of zero, and log Z."""
-    found = grid_filter(model, jnp.asarray(observations), grid)
-    above = float(found.mass_above(0.0)[-1])
-    return np.array([1 - above, above]), float(found.log_marginal_likelihood)
+    run = grid_filter(model, jnp.asarray(observations), grid)
+    above = float(run.mass_above(0.0)[-1])
+    return np.array([1 - above, above]), float(run.log_marginal_likelihood)
 
 
 def corridor(num_steps: int, seed: int) -> Scene:
     """Four doors that look alike: four masses of a quarter."""
     model = models.Corridor()
-    path, observations = model.simulated(num_steps, seed)
+    path, observations = model.simulate(num_steps, seed)
     return Scene(
         model, observations, lambda states: model.section(states, path[-1]), 8, {"scale": 1.0},
         exact=(np.full(4, 1 / 4), None), num_regions=4,
@@ -82,7 +82,7 @@ def bearings(num_steps: int, seed: int) -> Scene:
     """A target on either side of two lines of hydrophones."""
     model = models.Bearings()
     return Scene(
-        model, model.simulated(num_steps, seed), lambda states: by_sign(states["motion"][:, 1]), 4,
+        model, model.simulate(num_steps, seed), lambda states: by_sign(states["motion"][:, 1]), 4,
         {"features": lambda states: states["motion"][:, :2], "scale": 4.0},
         features=models.motion_and_turn, truth=1,
     )  # fmt: skip
@@ -92,7 +92,7 @@ def mirror(num_steps: int, seed: int) -> Scene:
     """Two halves in four dimensions, each the mirror image of the other."""
     model = models.Mirror()
     return Scene(
-        model, model.simulated(num_steps, seed), lambda states: by_sign(states[:, 1]), 4,
+        model, model.simulate(num_steps, seed), lambda states: by_sign(states[:, 1]), 4,
         {"features": lambda states: states[:, :2], "scale": 1.0},
         exact=(np.array([0.5, 0.5]), None), truth=1,
     )  # fmt: skip
@@ -101,7 +101,7 @@ def mirror(num_steps: int, seed: int) -> Scene:
 def terrain(num_steps: int, seed: int) -> Scene:
     """A flight over hills: many modes, one of them near the vehicle."""
     model = models.Terrain.drawn(seed + 3)
-    path, observations = model.simulated(num_steps, seed + 3)
+    path, observations = model.simulate(num_steps, seed + 3)
     place = jnp.asarray(path[-1])
 
     def is_near(states: Array) -> Array:
@@ -115,7 +115,7 @@ def terrain(num_steps: int, seed: int) -> Scene:
 def jumps(num_steps: int, seed: int) -> Scene:
     """A target that jumps now and then: two sides, and which of them is settled by and by."""
     model = models.Jumps()
-    path, observations = model.simulated(num_steps, seed + 4)
+    path, observations = model.simulate(num_steps, seed + 4)
     exact = of_grid(model, observations, JUMP_GRID)
     return Scene(
         model, observations, by_sign, 4, {"scale": 1.0}, exact=exact,

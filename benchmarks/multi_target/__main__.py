@@ -115,7 +115,9 @@ def _ours(scene: Scene, each: int) -> Run:
     def run(seed: int, scans: tuple[np.ndarray, ...]) -> Found:
         given = [jnp.asarray(plots, jnp.float32) for plots in scans]
         observations = tuple(given) if len(given) > 1 else given[0]
-        run = mpfjax.run_filter(jax.random.key(seed), filter, observations, collect=mpfjax.targets)
+        run = mpfjax.run_filter(
+            jax.random.key(seed), filter, observations, collect=mpfjax.estimate_targets
+        )
         told = jax.tree.map(np.asarray, run.collected)
         rest = (told.labels, told.expected_number, told.existence)
         return Found(told.means[..., PLACE], told.existence > 0.5, told.number, *rest)

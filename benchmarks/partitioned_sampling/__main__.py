@@ -67,40 +67,40 @@ def main(
     - `seed`: of the filters.
     """
     chosen = {"--scene": scene, "--keys": keys, "--sensitivity": sensitivity or None}
-    given = [name for name, value in {**chosen, "--sequence": sequence or None}.items()
+    options = [name for name, value in {**chosen, "--sequence": sequence or None}.items()
              if value is not None]  # fmt: skip
-    if len(given) > 1:
-        raise ValueError(f"{given[0]}: not with {given[1]}")
+    if len(options) > 1:
+        raise ValueError(f"{options[0]}: not with {options[1]}")
     size = particles or (200 if sequence else 300)
     if sensitivity:
         run_sensitivity(out, range(MOST_TRIED), scenes, size, runs, seed)
         return
     if sequence:
-        found = scene_files.real_scenes(sequence)
+        candidates = scene_files.real_scenes(sequence)
     elif scene is not None:
-        found = [(scene, scene_files.synthetic_scene(scene, **DEFAULT))]
+        candidates = [(scene, scene_files.synthetic_scene(scene, **DEFAULT))]
     else:
         among, most = (range(MOST_TRIED), scenes) if keys is None else (keys, None)
-        found = scene_files.synthetic_scenes(among, most)
+        candidates = scene_files.synthetic_scenes(among, most)
     lambdas = list(dict.fromkeys(lambdas or ((20.0,) if sequence else (20.0, 30.0, 40.0, 50.0))))
     methods = list(dict.fromkeys(methods))
     settings = settings_of({
         "orders": "objects in the order in which they move, counted from 1", "runs": runs,
         "num_particles": size, "seed": seed, "lambdas": lambdas,
     })  # fmt: skip
-    kept, rows, passed_over, started = [], [], [], time.perf_counter()
+    accepted, rows, passed_over, started = [], [], [], time.perf_counter()
     cycles = not sequence and "ps" in methods
-    for number, (name, one) in enumerate(found):
+    for number, (name, one) in enumerate(candidates):
         if one is None:
             passed_over.append(name)
             continue
-        kept.append(one)
+        accepted.append(one)
         rows += study(one, number, lambdas, size, methods, runs, seed, cycles=cycles)
         seconds = round(time.perf_counter() - started, 1)
-        content = tables.content_of(kept, rows)
+        content = tables.content_of(accepted, rows)
         settings |= {"seconds": seconds, "passed_over": passed_over}
         data(out / "partitioned_sampling.json", settings=settings, **content)
-    if not kept:
+    if not accepted:
         raise ValueError("--keys: the posterior keeps the scene of none of them")
     tables.print_tables(content)
     if content["figure_4"]:

@@ -112,16 +112,16 @@ def distance_maps(
     band = height // num_parts
     rows, columns = bins.shape[0] + height + 1, bins.shape[1] + width + 1
     # The pixels that the boxes hold, -1 outside the frame.
-    seen = np.pad(bins, ((height, height), (width, width)), constant_values=-1)
+    padded = np.pad(bins, ((height, height), (width, width)), constant_values=-1)
     roots = np.sqrt(references).astype(np.float32)
-    alike = np.zeros((num_objects, num_parts, len(seen) - band + 1, columns), np.float32)
+    alike = np.zeros((num_objects, num_parts, len(padded) - band + 1, columns), np.float32)
     for colour in np.flatnonzero(roots.any(axis=(0, 1))):
-        if not (seen == colour).any():
+        if not (padded == colour).any():
             continue
-        counts = np.sqrt(_box_sums(seen == colour, band, width), dtype=np.float32)
+        counts = np.sqrt(_box_sums(padded == colour, band, width), dtype=np.float32)
         for j, part in np.argwhere(roots[:, :, colour]):
             alike[j, part] += roots[j, part, colour] * counts
-    pixels = np.maximum(_box_sums(seen >= 0, band, width), 1).astype(np.float32)
+    pixels = np.maximum(_box_sums(padded >= 0, band, width), 1).astype(np.float32)
     alike /= np.sqrt(pixels)
     maps = np.full((num_objects, rows, columns), float(num_parts), np.float32)
     for part in range(num_parts):
@@ -174,4 +174,4 @@ def particle_means(
 
 
 def _mean_place(mixture: mpfjax.ParticleMixture):
-    return mixture.average(mixture.particles.box)
+    return mixture.expectation(mixture.particles.box)

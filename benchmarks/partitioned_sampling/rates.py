@@ -54,16 +54,16 @@ def shares_of(*outcomes: Outcomes) -> dict[str, Any]:
     its particles, and are no trials of their own. Precision and recall, which are ratios of sums
     over runs, have the normal one.
     """
-    found = {name: np.concatenate([one[name] for one in outcomes]) for name in outcomes[0]}
-    counts = found["count"]
+    joint = {name: np.concatenate([one[name] for one in outcomes]) for name in outcomes[0]}
+    counts = joint["count"]
     rates: dict[str, Any] = {"runs": len(counts)}
     for name in ("success", "recovery"):
-        rates[name] = float(found[name].mean())
+        rates[name] = float(joint[name].mean())
         rates[f"{name}_interval"] = wilson(rates[name], len(counts))
     for name in ("precision", "recall"):
         total, num = max(float(counts.sum()), 1.0), len(counts)
-        value = float(found[name].sum()) / total
-        spread = ((found[name] - value * counts) ** 2).sum() * num / max(num - 1, 1)
+        value = float(joint[name].sum()) / total
+        spread = ((joint[name] - value * counts) ** 2).sum() * num / max(num - 1, 1)
         reach = Z_95 * float(np.sqrt(spread)) / total if num > 1 and counts.any() else 1.0
         rates[name], rates[f"{name}_interval"] = value, _within(value, reach)
     return rates
@@ -76,8 +76,8 @@ def over_scenes(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """
     mean: dict[str, Any] = {"scenes": len(entries), "runs": sum(e["runs"] for e in entries)}
     if len(entries) == 1:
-        kept = [name + end for name in RATES for end in ("", "_interval")]
-        return mean | {name: entries[0][name] for name in kept}
+        names = [name + end for name in RATES for end in ("", "_interval")]
+        return mean | {name: entries[0][name] for name in names}
     for name in RATES:
         shares = np.array([entry[name] for entry in entries])
         value, deviation = float(shares.mean()), float(shares.std(ddof=1))
@@ -97,8 +97,8 @@ def how_far_apart(shares: np.ndarray, num_runs: int) -> dict[str, float]:
     `shares` is (scenes, orders). `p` is the probability of totals at least as uneven, if in each
     scene all orders recover alike: a χ² test of the orders' sums over scenes.
     """
-    means, own = shares.mean(axis=0), shares.mean(axis=1)
-    variance, totals = (own * (1 - own)).sum() / num_runs, shares.sum(axis=0)
+    means, of_each = shares.mean(axis=0), shares.mean(axis=1)
+    variance, totals = (of_each * (1 - of_each)).sum() / num_runs, shares.sum(axis=0)
     statistic = ((totals - totals.mean()) ** 2).sum() / max(variance, 1e-12)
     return {
         "num_orders": shares.shape[1], "runs": num_runs, "mean": means.mean(),

@@ -60,15 +60,15 @@ def synthetic_scenes(
 
     It ends with the scene that makes them `most`, or with the keys. No filter has run by then.
     """
-    found = 0
+    number = 0
     for key in keys:
         try:
             scene = synthetic_scene(key, only_if_kept=True, **setting)
         except NoPath:
             scene = None
-        found += scene is not None
+        number += scene is not None
         yield key, scene
-        if found == most:
+        if number == most:
             return
 
 
@@ -127,7 +127,7 @@ def real_scenes(folders: Sequence[Path]) -> Iterator[tuple[str, Scene]]:
     are there, and ends ten frames after, or with the object; who comes only to hide it is none of
     its objects. Raises `ValueError` for a sequence without any.
     """
-    found = []
+    candidates = []
     for folder in folders:
         if not folder.is_dir():
             raise ValueError(f"--sequence: {folder} is not a folder")
@@ -140,8 +140,8 @@ def real_scenes(folders: Sequence[Path]) -> Iterator[tuple[str, Scene]]:
                 f"--sequence: in {folder.name} no object is covered for {LEAST_FRAMES} frames and"
                 " comes out elsewhere"
             )
-        found += [(folder, rows, *event) for event in events]
-    for event in found:
+        candidates += [(folder, rows, *event) for event in events]
+    for event in candidates:
         scene = _real_scene(*event)
         yield scene.name, scene
 

@@ -57,10 +57,12 @@ def run_sensitivity(
     harness.figures(out, dpi=110, sensitivity=draw_sensitivity(entries))
 
 
-def _run_case(found: Any, num_particles: int, num_runs: int, seed: int) -> list[dict[str, Any]]:
+def _run_case(
+    candidates: Any, num_particles: int, num_runs: int, seed: int
+) -> list[dict[str, Any]]:
     """Success and precision of objects 2 to 7 and recovery of object 1, for each filter."""
     scenes, rows, tried = [], [], 0
-    for number, (_, scene) in enumerate(found):
+    for number, (_, scene) in enumerate(candidates):
         tried = number + 1
         if scene is not None:
             scenes.append(scene)
@@ -92,9 +94,9 @@ def draw_sensitivity(entries: Sequence[dict[str, Any]]) -> Any:
               if DEFAULT | changed == DEFAULT}  # fmt: skip
 
     def panel(name: str, rate: str, label: str, limits: tuple[float, float]) -> plotting.Panel:
-        own = [entry for entry in entries if entry["axis"] == name]
+        rows = [entry for entry in entries if entry["axis"] == name]
         ends = (lambda e, i=i: e[f"{rate}_interval"][i] for i in (0, 1))
-        lines = plotting.lines_of(own, "filter", "value", rate, *ends)
+        lines = plotting.lines_of(rows, "filter", "value", rate, *ends)
         return plotting.Panel("", name, label, lines, limits, chosen[name])
 
     shown = [name for name in chosen if any(entry["axis"] == name for entry in entries)]

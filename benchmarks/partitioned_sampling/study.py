@@ -43,11 +43,11 @@ class Collect(eqx.Module):
 
     def __call__(self, mixture: mpfjax.ParticleMixture) -> dict[str, Any]:
         """Of each object."""
-        kept = {"boxes": mixture.average(self.boxes_of(self.model, mixture.particles))}
+        summary = {"boxes": mixture.expectation(self.boxes_of(self.model, mixture.particles))}
         if self.everything:
-            kept["uniqueness"] = uniqueness(mixture.particles.box)
-            kept["variance"] = jnp.var(mixture.particles.box[:, :, :2], axis=0)
-        return kept
+            summary["uniqueness"] = uniqueness(mixture.particles.box)
+            summary["variance"] = jnp.var(mixture.particles.box[:, :, :2], axis=0)
+        return summary
 
 
 def circular_orders(num_objects: int) -> list[tuple[int, ...]]:
@@ -59,12 +59,12 @@ def other_cycles(num_objects: int, most: int = 20) -> list[tuple[int, ...]]:
     """A sample of the (J-1)! - 1 cycles that are no circular shift of 0, ..., J-1, from 0 on."""
     rng, natural = np.random.default_rng(0), tuple(range(num_objects))
     others = int(np.prod(np.arange(1, num_objects), dtype=float)) - 1
-    found: dict[tuple[int, ...], None] = {}
-    while len(found) < min(most, others):
+    orders: dict[tuple[int, ...], None] = {}
+    while len(orders) < min(most, others):
         order = (0, *(1 + rng.permutation(num_objects - 1)).tolist())
         if order != natural:
-            found[order] = None
-    return list(found)
+            orders[order] = None
+    return list(orders)
 
 
 def study(
@@ -91,24 +91,24 @@ def study(
         if cycles and lambda_ == lambdas[0]:
             chosen += [(CYCLE, order) for order in other_cycles(scene.truth.shape[1])]
         # Numbers that do not fit come to light here, before anything compiles.
-        made = [METHODS["ps" if name == CYCLE else name](model, num_particles, order)
+        filters = [METHODS["ps" if name == CYCLE else name](model, num_particles, order)
                 for name, order in chosen]  # fmt: skip
         # No two rows have keys in common, whatever other λ there are.
         key = jax.random.fold_in(jax.random.key(seed), number)
         key = jax.random.fold_in(key, round(1000 * lambda_))
-        bar = tqdm(made, desc=f"{scene.name}, λ = {lambda_:g}", unit="row", disable=None)
+        bar = tqdm(filters, desc=f"{scene.name}, λ = {lambda_:g}", unit="row", disable=None)
         for place, filter in enumerate(bar):
             name, order = chosen[place]
             keys = jax.random.split(jax.random.fold_in(key, place), num_runs)
             everything = lambda_ == lambdas[0] and name in SHOWN
             collect = Collect(model, scene.boxes_of, everything)
             run = mpfjax.monte_carlo(keys, filter, scene.observations, collect)
-            kept = jax.tree.map(np.asarray, run.collected)
+            summary = jax.tree.map(np.asarray, run.collected)
             rows.append({
                 "scene": scene.key, "lambda": lambda_, "method": name,
-                "order": None if order is None else [j + 1 for j in order], "kept": kept,
+                "order": None if order is None else [j + 1 for j in order], "kept": summary,
                 "rates": {
-                    table: measure(kept["boxes"][:, :, objects], scene.truth[:, objects])
+                    table: measure(summary["boxes"][:, :, objects], scene.truth[:, objects])
                     for table, objects in scene.tables.items()
                 },
             })  # fmt: skip

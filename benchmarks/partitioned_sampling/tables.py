@@ -39,11 +39,11 @@ PAPER_RATES = {"1": "suc pre rcl", "2": "rcv pre rcl", "3": "suc rcv pre rcl, Re
 
 def content_of(scenes: Sequence[Scene], rows: Rows) -> dict[str, Any]:
     """Tables, their summaries over orders, means over scenes, and figure 4 or 8."""
-    own = [row for row in rows if row["method"] != CYCLE]
+    plain = [row for row in rows if row["method"] != CYCLE]
     tables, summary, means = {}, {}, {}
     for name in scenes[0].tables:
-        tables[name] = [_head(row) | shares_of(row["rates"][name]) for row in own]
-        summary[name] = _over_orders(name, [row for row in own if row["method"] == "ps"])
+        tables[name] = [_head(row) | shares_of(row["rates"][name]) for row in plain]
+        summary[name] = _over_orders(name, [row for row in plain if row["method"] == "ps"])
         means[name] = _means(tables[name] + summary[name])
     return {
         "scenes": [
@@ -54,9 +54,9 @@ def content_of(scenes: Sequence[Scene], rows: Rows) -> dict[str, Any]:
         "tables": tables,
         "summary": summary,
         "means": means,
-        "circular_orders": orders_of([row for row in own if row["method"] == "ps"], True),
+        "circular_orders": orders_of([row for row in plain if row["method"] == "ps"], True),
         "other_cycles": orders_of([row for row in rows if row["method"] == CYCLE], False),
-        "figure_4": impoverishment(scenes, own),
+        "figure_4": impoverishment(scenes, plain),
     }
 
 
@@ -64,7 +64,7 @@ def _head(row: dict[str, Any]) -> dict[str, Any]:
     return {name: row[name] for name in KEYS}
 
 
-def _grouped(entries: Rows, *names: str) -> dict[tuple, list[dict[str, Any]]]:
+def _group(entries: Rows, *names: str) -> dict[tuple, list[dict[str, Any]]]:
     """The entries that have these values in common."""
     groups: dict[tuple, list[dict[str, Any]]] = {}
     for entry in entries:
@@ -78,13 +78,13 @@ def _over_orders(table: str, ps: Rows) -> list[dict[str, Any]]:
     The worst recovers least, and of several that do, succeeds least.
     """
     entries = []
-    for rows in _grouped(ps, "scene", "lambda").values():
-        found = [row["rates"][table] for row in rows]
-        order = [(one["recovery"].mean(), one["success"].mean()) for one in found]
+    for rows in _group(ps, "scene", "lambda").values():
+        rates = [row["rates"][table] for row in rows]
+        order = [(one["recovery"].mean(), one["success"].mean()) for one in rates]
         worst, last = order.index(min(order)), len(rows[0]["order"]) - 1
-        chosen = {"mean": found, "worst": [found[worst]]}
+        chosen = {"mean": rates, "worst": [rates[worst]]}
         for place, at in {"first": 0, "middle": (last + 1) // 2, "last": last}.items():
-            chosen[place] = [found[[row["order"][at] for row in rows].index(1)]]
+            chosen[place] = [rates[[row["order"][at] for row in rows].index(1)]]
         entries += [
             _head(rows[0]) | {"order": name, "worst": rows[worst]["order"]} | shares_of(*runs)
             for name, runs in chosen.items()
@@ -96,24 +96,24 @@ def _means(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Means over scenes; of the orders only what a summary says of them."""
     named = [entry for entry in entries if not isinstance(entry["order"], list)]
     names = "lambda", "method", "order"
-    groups = sorted(_grouped(named, *names).items(), key=lambda item: item[0][0])
+    groups = sorted(_group(named, *names).items(), key=lambda item: item[0][0])
     return [dict(zip(names, key, strict=True)) | over_scenes(group) for key, group in groups]
 
 
 def orders_of(ps: Rows, circular: bool) -> list[dict[str, Any]]:
     """How far the hard object's recovery by these orders lies apart, for each λ."""
     entries = []
-    for (lambda_,), rows in _grouped(ps, "lambda").items():
+    for (lambda_,), rows in _group(ps, "lambda").items():
         scenes = [[row["rates"][list(row["rates"])[-1]]["recovery"] for row in group]
-                  for group in _grouped(rows, "scene").values()]  # fmt: skip
+                  for group in _group(rows, "scene").values()]  # fmt: skip
         if len({len(orders) for orders in scenes}) > 1 or len(scenes[0]) < 2:
             continue  # as many orders as objects, which real scenes differ in
         shares = np.array(scenes).mean(axis=(2, 3))
-        found = how_far_apart(shares, scenes[0][0].size)
+        spread = how_far_apart(shares, scenes[0][0].size)
         orders = [str(row["order"]) for row in rows[: len(scenes[0])]]
         kind = "circular orders" if circular else "other cycles"
         recovery = dict(zip(orders, shares.mean(axis=0).tolist(), strict=True))
-        entries.append({"lambda": lambda_, "kind": kind} | found | {"recovery": recovery})
+        entries.append({"lambda": lambda_, "kind": kind} | spread | {"recovery": recovery})
     return entries
 
 
@@ -127,11 +127,11 @@ def impoverishment(scenes: Sequence[Scene], rows: Rows) -> list[dict[str, Any]]:
     values: dict[str, list[np.ndarray]] = {}
     orders = {}
     for row in rows:
-        kept = row["kept"]
-        if "uniqueness" not in kept or kept["boxes"].shape[2] != scenes[0].truth.shape[1]:
+        summary = row["kept"]
+        if "uniqueness" not in summary or summary["boxes"].shape[2] != scenes[0].truth.shape[1]:
             continue
-        reach = kept["variance"] / deviations[row["scene"]] ** 2
-        shares = np.concatenate([kept["uniqueness"][..., None], reach], axis=-1)
+        reach = summary["variance"] / deviations[row["scene"]] ** 2
+        shares = np.concatenate([summary["uniqueness"][..., None], reach], axis=-1)
         name = FILTERS[row["method"]]
         if row["order"] is not None:
             name += f" {{{'→'.join(map(str, row['order']))}}}"
@@ -140,8 +140,8 @@ def impoverishment(scenes: Sequence[Scene], rows: Rows) -> list[dict[str, Any]]:
     measures = "uniqueness", "dynamics_u", "dynamics_v"
     return [
         {"filter": name, "order": orders[name]}
-        | dict(zip(measures, np.mean(found, axis=0), strict=True))
-        for name, found in values.items()
+        | dict(zip(measures, np.mean(shares_of_runs, axis=0), strict=True))
+        for name, shares_of_runs in values.items()
     ]
 
 
@@ -205,7 +205,7 @@ def scene_table(content: dict[str, Any], table: str) -> str:
     named = [entry for entry in entries if entry["order"] in (None, "mean")]
     means = [
         scenes[scene] | {"filter": method, "mean": np.mean([e["recovery"] for e in group])}
-        for (scene, method), group in _grouped(named, "scene", "method").items()
+        for (scene, method), group in _group(named, "scene", "method").items()
     ]
     frames = ", posterior left in frame {left}, back in {back}" if table == "2" else ""
     cell = lambda entry: f"{100 * entry['mean']:.0f}"  # noqa: E731

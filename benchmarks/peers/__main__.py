@@ -74,10 +74,10 @@ def main(
 
 def chosen_libraries() -> list[str]:
     """The names of what runs, mpfjax first; says which rival is not installed."""
-    found = {name: importlib.util.find_spec(name.partition("_")[0]) for name in LIBRARIES}
-    if missing := [name for name, spec in found.items() if spec is None]:
+    specs = {name: importlib.util.find_spec(name.partition("_")[0]) for name in LIBRARIES}
+    if missing := [name for name, spec in specs.items() if spec is None]:
         print(f"not installed, see docs/speed.md: {', '.join(missing)}", file=sys.stderr)
-    return [name for name, spec in found.items() if spec is not None]
+    return [name for name, spec in specs.items() if spec is not None]
 
 
 def run_of(pool: ProcessPoolExecutor, name: str, job: str, size: int, seeds: int) -> Run:
@@ -89,10 +89,10 @@ def exact_log_likelihood(job: Job) -> float:
     """log p(y_1..y_t), by quadrature or by the Kalman filter."""
     model, observations = model_of(job), jnp.asarray(job.observations)
     if isinstance(job, Quadratic):
-        found = grid_filter(model, observations, jnp.linspace(-4.0, 4.0, 1601))
+        run = grid_filter(model, observations, jnp.linspace(-4.0, 4.0, 1601))
     else:
-        found = kalman_filter(model, observations)
-    return float(found.log_marginal_likelihood)
+        run = kalman_filter(model, observations)
+    return float(run.log_marginal_likelihood)
 
 
 # --- what is measured: whether a library gives mpfjax's answer, then its times, in turns ---------
@@ -104,12 +104,12 @@ def time_cell(libraries: Mapping[str, Run], exact: float, repeats: int) -> list[
     The first run of each is checked and counts as its start; then they take turns in random
     order. One that is slow is timed less often.
     """
-    found: dict[str, list[dict[str, Any]]] = {name: [] for name in libraries}
+    runs_of: dict[str, list[dict[str, Any]]] = {name: [] for name in libraries}
     reasons: dict[str, str | None] = {}
     for name, run in libraries.items():
         try:
-            found[name].append(run(0))
-            reasons[name] = disagreement(found[name][0], found["mpfjax"][0], exact)
+            runs_of[name].append(run(0))
+            reasons[name] = disagreement(runs_of[name][0], runs_of["mpfjax"][0], exact)
         except Exception as error:  # the others go on without a library that fails
             if name == "mpfjax":
                 raise
@@ -117,7 +117,7 @@ def time_cell(libraries: Mapping[str, Run], exact: float, repeats: int) -> list[
         if reasons[name] is not None:
             print(f"{name} is not timed: {reasons[name]}", file=sys.stderr)
     timed = {
-        name: lambda turn, name=name: found[name].append(libraries[name](1 + turn))
+        name: lambda turn, name=name: runs_of[name].append(libraries[name](1 + turn))
         for name, reason in reasons.items()
         if reason is None
     }
@@ -126,19 +126,19 @@ def time_cell(libraries: Mapping[str, Run], exact: float, repeats: int) -> list[
     for name, reason in reasons.items():
         entries.append({"library": name, "refused": reason, "median": None})
         if reason is None:
-            entries[-1] |= of_runs(found[name])
+            entries[-1] |= of_runs(runs_of[name])
             entries[-1]["ratio"] = entries[-1]["median"] / entries[0]["median"]
     return entries
 
 
-def of_runs(found: list[dict[str, Any]]) -> dict[str, Any]:
+def of_runs(runs: list[dict[str, Any]]) -> dict[str, Any]:
     """What the runs of a library took, of which the first one compiles, and what they found."""
-    first, *others = found
+    first, *others = runs
     seconds = [run["seconds"] for run in others]
     median = float(np.median(seconds))
     return {
         "version": first["version"], "seconds": seconds, "median": median,
-        "start": max(first["seconds"] - median, 0.0), "memory": max(r["memory"] for r in found),
+        "start": max(first["seconds"] - median, 0.0), "memory": max(r["memory"] for r in runs),
         "log_likelihood_mean": float(np.mean(first["log_likelihoods"])),
         "log_likelihood_std": float(np.std(first["log_likelihoods"])),
         "effective_sample_size": float(np.mean(first["effective_sample_sizes"])),
@@ -146,7 +146,7 @@ def of_runs(found: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def disagreement(
-    found: Mapping[str, Any], reference: Mapping[str, Any], exact: float
+    answer: Mapping[str, Any], reference: Mapping[str, Any], exact: float
 ) -> str | None:
     """Why these are not results of the same filter, or None.
 
@@ -155,7 +155,7 @@ def disagreement(
     to normal.
     """
     for what in ("log_likelihoods", "effective_sample_sizes"):
-        ours, others = np.array(found[what]), np.array(reference[what])
+        ours, others = np.array(answer[what]), np.array(reference[what])
         if not np.isfinite(ours).all():
             return f"{what.replace('_', ' ')} that are not finite"
         gap = abs(ours.mean() - others.mean())
@@ -164,7 +164,7 @@ def disagreement(
         test: Any = stats.ttest_ind(ours, others, equal_var=False)
         if test.pvalue < LEVEL:
             return f"mean {what.replace('_', ' ')} {ours.mean():.6g}, not {others.mean():.6g}"
-    estimates = np.array(found["log_likelihoods"])
+    estimates = np.array(answer["log_likelihoods"])
     number, variance = len(estimates), estimates.var(ddof=1)
     if variance > MOST_SPREAD**2:
         return None
@@ -179,11 +179,11 @@ def disagreement(
 
 def as_tables(job: str, results: list[dict[str, Any]]) -> str:
     """Times with their ratios to mpfjax's, and below them starts and memory."""
-    own = [entry for entry in results if entry["job"] == job]
+    rows = [entry for entry in results if entry["job"] == job]
     forms = {"median [ms], ratio": _time, "start [s], memory [MB]": _start}
     name = lambda entry: LIBRARIES[entry["library"]]  # noqa: E731
     tables = [
-        harness.pivot(title, own, name, "N = {particles}", form) for title, form in forms.items()
+        harness.pivot(title, rows, name, "N = {particles}", form) for title, form in forms.items()
     ]
     return "\n\n".join([JOBS[job].title, *tables])
 
@@ -204,11 +204,11 @@ def draw(results: list[dict[str, Any]]) -> Any:
     """Time against N, a panel for each job and a line for each library."""
     panels = []
     for job in dict.fromkeys(entry["job"] for entry in results):
-        own = [e for e in results if e["job"] == job and e["median"] is not None]
+        rows = [e for e in results if e["job"] == job and e["median"] is not None]
         # The median of the repeats, and where the middle half of them lies.
         quartiles = [lambda e, q=q: 1000 * np.quantile(e["seconds"], q) for q in (0.5, 0.25, 0.75)]
         name = lambda e: LIBRARIES[e["library"]]  # noqa: E731
-        lines = plotting.lines_of(own, name, "particles", *quartiles)
+        lines = plotting.lines_of(rows, name, "particles", *quartiles)
         title = f"{JOBS[job].title}, {JOBS[job].num_steps} steps"
         axes = "number of particles $N$", "time of all runs (ms)"
         panels.append(plotting.Panel(title, *axes, lines))

@@ -112,12 +112,12 @@ def through_blackjax(job: Job, num_particles: int) -> Callable[[Any], tuple[Any,
     initial, transition = jax_functions(job)
     observations = jnp.asarray(job.observations)
 
-    def kept(state: Any, increment: Any) -> tuple[Any, Any, Any]:
+    def summary(state: Any, increment: Any) -> tuple[Any, Any, Any]:
         return state.weights @ state.particles, 1 / jnp.sum(state.weights**2), increment
 
     steps = blackjax_steps(
         lambda key: initial(key, (num_particles, *job.state_shape)),
-        lambda key, x, _: transition(key, x), job.log_likelihood, kept,
+        lambda key, x, _: transition(key, x), job.log_likelihood, summary,
     )  # fmt: skip
 
     def run(key: Any) -> tuple[Any, Any, Any]:
@@ -131,11 +131,11 @@ def blackjax_steps(
     initial: Callable[[Any], Any],
     transition: Callable[[Any, Any, Any], Any],
     log_likelihood: Callable[[Any, Any], Any],
-    kept: Callable[[Any, Any], Any],
+    summary: Callable[[Any, Any], Any],
 ) -> Callable[[Any, Any], Any]:
     """`smc.base.step` in a scan, as its docstring says: M_t, G_t and R_t of Feynman-Kac.
 
-    A function of a key and a series: what is `kept` of each step, of the state and the increment
+    A function of a key and a series: what is `summary` of each step, of the state and the increment
     of log Ẑ. `transition` and `log_likelihood` are given the series' row. blackjax hands
     `update_fn` a key for each particle. One of them draws for all, which is faster.
     """
@@ -155,7 +155,7 @@ def blackjax_steps(
                 weight_fn=lambda x: log_likelihood(now, x),
                 resample_fn=resampling.systematic,
             )
-            return new, kept(new, info.log_likelihood_increment)
+            return new, summary(new, info.log_likelihood_increment)
 
         keys = jax.random.split(steps_key, len(jax.tree.leaves(series)[0]))
         return jax.lax.scan(advance, base.init(initial(initial_key), {}), (keys, series))[1]

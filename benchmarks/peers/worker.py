@@ -36,16 +36,16 @@ def _silent() -> None:
 
 
 @cache
-def begun(library: str, job: str) -> dict[str, Any]:
+def settings_at_start(library: str, job: str) -> dict[str, Any]:
     """Version, devices and memory, once all is imported that jobs are not charged for."""
     name = library.partition("_")[0]
-    told: dict[str, Any] = {"version": metadata.version(name)}
+    settings: dict[str, Any] = {"version": metadata.version(name)}
     if name != "particles":
         import jax
 
-        told["devices"] = [device.device_kind for device in jax.devices()]
+        settings["devices"] = [device.device_kind for device in jax.devices()]
     libraries.prepare(library, JOBS[job], 2, 2)
-    return told | {"memory": peak_memory()}
+    return settings | {"memory": peak_memory()}
 
 
 _prepare = cache(libraries.prepare)
@@ -55,16 +55,16 @@ def run_once(
     library: str, job: str, num_particles: int, num_seeds: int, seed: int
 ) -> dict[str, Any]:
     """Seconds of one run of the job, MB above the imports', and what came out for each seed."""
-    told = begun(library, job)
+    settings = settings_at_start(library, job)
     prepared = _prepare(library, JOBS[job], num_particles, num_seeds)
-    given = prepared.make_input(seed)
+    argument = prepared.make_input(seed)
     start = time.perf_counter()
-    result = prepared.run(given)
+    result = prepared.run(argument)
     seconds = time.perf_counter() - start
     _, sizes, log_likelihoods = (np.asarray(value, float) for value in result)
-    return told | {
+    return settings | {
         "seconds": seconds,
-        "memory": peak_memory() - told["memory"],
+        "memory": peak_memory() - settings["memory"],
         "log_likelihoods": log_likelihoods,
         "effective_sample_sizes": sizes.mean(axis=1),
     }

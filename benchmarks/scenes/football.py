@@ -267,10 +267,10 @@ def _draw_ellipse(
 ) -> None:  # fmt: skip
     """Draw a filled ellipse along the axes."""
     (cx, cy), (rx, ry) = centre, radii
-    found = _window(frame, np.subtract(centre, radii), np.add(centre, radii), 1)
-    if found is None:
+    window = _window(frame, np.subtract(centre, radii), np.add(centre, radii), 1)
+    if window is None:
         return
-    part, x, y = found
+    part, x, y = window
     inside = (1 - np.hypot((x - cx) / rx, (y - cy) / ry)) * min(rx, ry)
     _blend(part, np.clip(inside + 0.5, 0, 1) * opacity, colour)
 
@@ -287,10 +287,10 @@ def _draw_stroke(
 ) -> None:
     """Draw a line of half-width `radius` with round ends; a dot where the ends coincide."""
     (x0, y0), (x1, y1) = start, end
-    found = _window(frame, np.minimum(start, end), np.maximum(start, end), radius + 1)
-    if found is None:
+    window = _window(frame, np.minimum(start, end), np.maximum(start, end), radius + 1)
+    if window is None:
         return
-    part, x, y = found
+    part, x, y = window
     dx, dy = x1 - x0, y1 - y0
     along = ((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-9)
     along = np.clip(along, 0, 1)

@@ -64,11 +64,11 @@ def main(
         finish("modes", modes(job, mode_particles, seeds, seed), title)
     if "posteriors" in parts:
         truth = posteriors.exact(job)
-        found = posteriors.measure(job, posterior_particles, posterior_steps, seed)
+        draws = posteriors.measure(job, posterior_particles, posterior_steps, seed)
         title = f"posterior of two parameters, N = {posterior_particles}, "
         title += f"chains of {posterior_steps} steps"
-        finish("posteriors", posteriors.summary(truth, found), title, posteriors.COLUMNS)
-        harness.figures(out, dpi=130, posteriors=posteriors.picture(truth, found))
+        finish("posteriors", posteriors.summary(truth, draws), title, posteriors.COLUMNS)
+        harness.figures(out, dpi=130, posteriors=posteriors.picture(truth, draws))
     print(f"written to {out}")
 
 
@@ -80,7 +80,7 @@ def main(
 def _auxiliary(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
     proposal = mpfjax.GaussNewtonProposal()
     plain = mpfjax.mixture_particle_filter(model, num_particles, 2)
-    return mpfjax.with_point_sets(mpfjax.with_lookahead(plain, proposal))
+    return mpfjax.with_quasi_monte_carlo(mpfjax.with_lookahead(plain, proposal))
 
 
 def _guided(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
@@ -106,8 +106,8 @@ def modes(job: Quadratic, num_particles: int, seeds: int, seed: int) -> list[dic
     keys = jax.random.split(jax.random.key(seed), seeds)
     entries = []
     for name, make in FILTERS.items():
-        found = _smoothed(keys, make(model, num_particles), observations)
-        for method, masses in zip(("genealogy", "backward sampling"), found, strict=True):
+        estimates = _smoothed(keys, make(model, num_particles), observations)
+        for method, masses in zip(("genealogy", "backward sampling"), estimates, strict=True):
             values = np.asarray(masses)
             lost = np.minimum(values, 1 - values) < LOST
             errors = np.sqrt(np.mean((values - 0.5) ** 2, axis=0))
@@ -125,8 +125,8 @@ def _smoothed(keys: Any, filter: mpfjax.Filter, observations: Any) -> Any:
     def one(key: Any) -> tuple[Any, Any]:
         key_run, key_back = jax.random.split(key)
         run = mpfjax.run_filter(key_run, filter, observations)
-        traced = run.final.average(trace_ancestors(run).trajectories > 0)
-        paths = sample_trajectories(key_back, filter.model, run, NUM_TRAJECTORIES)
+        traced = run.final.expectation(trace_ancestors(run).trajectories > 0)
+        paths = sample_trajectories(key_back, filter, run, NUM_TRAJECTORIES)
         return traced, jnp.mean(paths > 0, axis=0)
 
     return jax.lax.map(one, keys, batch_size=min(10, len(keys)))

@@ -91,11 +91,11 @@ def measure(job: Quadratic, num_particles: int, num_steps: int, seed: int) -> Dr
             key, filter, observations, num_steps=num_steps, num_chains=2, log_prior=log_prior,
             proposal_deviations=0.2, **chosen,
         )  # fmt: skip
-        kept = {
+        draws = {
             name: np.asarray(posterior.parameters[name])[:, num_steps // 10 :] for name in NAMES
         }
-        size = min(_effective(np.log(values)) for values in kept.values())
-        flat = {name: values.ravel() for name, values in kept.items()}
+        size = min(_effective(np.log(values)) for values in draws.values())
+        flat = {name: values.ravel() for name, values in draws.items()}
         return {"values": flat, "weights": None, "size": size}
 
     def sequential(key: Any) -> dict[str, Any]:
@@ -113,12 +113,12 @@ def measure(job: Quadratic, num_particles: int, num_steps: int, seed: int) -> Dr
         "particle Gibbs": partial(chains, tuning.particle_gibbs),
         "SMC²": sequential,
     }
-    found: Draws = {}
+    draws: Draws = {}
     for key, (name, sample) in zip(keys, samplers.items(), strict=True):
         start = time.perf_counter()
-        found[name] = sample(key)
-        found[name]["seconds"] = time.perf_counter() - start
-    return found
+        draws[name] = sample(key)
+        draws[name]["seconds"] = time.perf_counter() - start
+    return draws
 
 
 def _effective(chains: np.ndarray) -> float:
@@ -127,7 +127,7 @@ def _effective(chains: np.ndarray) -> float:
     return float(effective_sample_size(jnp.asarray(chains)))
 
 
-def summary(truth: dict[str, np.ndarray], found: Draws) -> list[dict[str, Any]]:
+def summary(truth: dict[str, np.ndarray], draws_of: Draws) -> list[dict[str, Any]]:
     """Mean and deviation of each parameter, with the error of the mean in standard errors."""
     step = float(np.log(AXIS[1] / AXIS[0]))
     entries = []
@@ -137,21 +137,21 @@ def summary(truth: dict[str, np.ndarray], found: Draws) -> list[dict[str, Any]]:
         deviation = float(np.sqrt(shares @ (AXIS - mean) ** 2))
         head = {"parameter": name}
         entries.append(head | {"sampler": "grid filter", "mean": mean, "deviation": deviation})
-        for sampler, draws in found.items():
+        for sampler, draws in draws_of.items():
             values, weights, size = draws["values"][name], draws["weights"], draws["size"]
-            own = np.average(values, weights=weights)
-            spread = np.sqrt(np.average((values - own) ** 2, weights=weights))
+            estimate = np.average(values, weights=weights)
+            spread = np.sqrt(np.average((values - estimate) ** 2, weights=weights))
             error = deviation / np.sqrt(size)
             entries.append(head | {
-                "sampler": sampler, "mean": float(own), "deviation": float(spread),
-                "standard_errors_off": float((own - mean) / error),
+                "sampler": sampler, "mean": float(estimate), "deviation": float(spread),
+                "standard_errors_off": float((estimate - mean) / error),
                 "effective_samples": size, "seconds": draws["seconds"],
                 "effective_samples_per_second": size / draws["seconds"],
             })  # fmt: skip
     return entries
 
 
-def picture(truth: dict[str, np.ndarray], found: Draws) -> Figure:
+def picture(truth: dict[str, np.ndarray], draws_of: Draws) -> Figure:
     """For each parameter the distribution function of every sampler's draws and the exact one."""
     figure = Figure(figsize=(8, 3.6), layout="constrained")
     for panel, (name, label) in zip(figure.subplots(1, 2, sharey=True), NAMES.items(), strict=True):
@@ -159,7 +159,7 @@ def picture(truth: dict[str, np.ndarray], found: Draws) -> Figure:
         exact = (np.cumsum(shares) - shares / 2) / shares.sum()
         panel.plot(AXIS, exact, color="0.2", lw=4, alpha=0.3, label="grid filter, exact")
         for (sampler, draws), colour, line in zip(
-            found.items(), plotting.COLOURS, ("-", "--", ":"), strict=False
+            draws_of.items(), plotting.COLOURS, ("-", "--", ":"), strict=False
         ):
             values, weights = draws["values"][name], draws["weights"]
             panel.ecdf(values, weights, color=colour, ls=line, lw=1.4, label=sampler)

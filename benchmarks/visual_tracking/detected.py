@@ -17,9 +17,9 @@ from mpfjax.moves.base import AbstractMove, AbstractPropagation
 from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
 from mpfjax.vision.tracking.detections import FrameDetections
 from mpfjax.vision.tracking.gaussian import Gaussian, places_of, units
-from mpfjax.vision.tracking.step import WEAK_ERROR, advanced
+from mpfjax.vision.tracking.step import WEAK_ERROR, advance
 from mpfjax.vision.tracking.track import offline_rows
-from mpfjax.vision.tracking.tracker import coloured
+from mpfjax.vision.tracking.tracker import with_colours
 
 MAX_DETECTIONS, MAX_OBJECTS, PARTICLES = 32, 24, 16
 # Weights within a component differ by at most the factor e^30.
@@ -108,19 +108,19 @@ class FollowDetections(AbstractPropagation):
         sizes = jnp.exp(mixture.particles.place[:, 2:])
         unit = jnp.concatenate([sizes, jnp.ones_like(sizes)], axis=1)
         with jax.numpy_rank_promotion("allow"):
-            moved = mixture.particles.predicted(*seen.noises, unit)
-        updated, gap, variance = moved.updated(place, error)
+            moved = mixture.particles.predict(*seen.noises, unit)
+        updated, gap, variance = moved.update(place, error)
         log_z = -0.5 * jnp.sum(gap**2 / variance + jnp.log(variance), axis=1)
-        offset = log_z - mixture.component_averages(log_z)[owner]
+        offset = log_z - mixture.component_expectations(log_z)[owner]
         ratio = jnp.exp(jnp.clip(offset, -FARTHEST, FARTHEST))
         p = seen.probability[owner]
-        own = p * ratio / mixture.component_averages(ratio)[owner]
+        own = p * ratio / mixture.component_expectations(ratio)[owner]
         factor = jnp.where(seen.there[owner], own + 1 - p, 1.0)
         share = jnp.where(seen.there[owner], own / factor, 0.0)
         if not self.matched:
             share = jnp.where(jax.random.uniform(key, share.shape) < share, 1.0, 0.0)
-        particles = updated.mixed_with(moved, share[:, None])
-        begun, born = Gaussian.begun(place, error, seen.speed[owner]), seen.born[owner]
+        particles = updated.mix(moved, share[:, None])
+        begun, born = Gaussian.initial(place, error, seen.speed[owner]), seen.born[owner]
         particles = jax.tree.map(partial(jnp.where, born[:, None]), begun, particles)
         weights = jnp.where(born, 1.0, mixture.component_weights * factor)
         total = mixture.replace(log_weights=jnp.log(weights))
@@ -131,11 +131,13 @@ class FollowDetections(AbstractPropagation):
 def moments(mixture: ParticleMixture) -> Gaussian:
     """Those of each component: of the mixture of its particles' Gaussians."""
     particles, owner = mixture.particles, mixture.component_indicators
-    means: Any = jax.tree.map(mixture.component_averages, particles)
+    means: Any = jax.tree.map(mixture.component_expectations, particles)
     away = particles.place - means.place[owner]
     away_velocity = particles.velocity - means.velocity[owner]
     products = away**2, away * away_velocity, away_velocity**2
-    spread = (a + mixture.component_averages(b) for a, b in zip(means[2:], products, strict=True))
+    spread = (
+        a + mixture.component_expectations(b) for a, b in zip(means[2:], products, strict=True)
+    )
     return Gaussian(means.place, means.velocity, *spread)
 
 
@@ -153,7 +155,7 @@ class Decider:
         """The tracks, a row for each component, and what its particles need of them."""
         own = [self.seats[name] for name in self.state.lives.identities.tolist()]
         state = self.state._replace(objects=moments.at(np.array(own, int)))
-        self.state, tracks = advanced(self.tracker, state, found)
+        self.state, tracks = advance(self.tracker, state, found)
         names = tracks.identities.tolist()
         kept = {name: seat for name, seat in self.seats.items() if name in names}
         free = [seat for seat in range(MAX_OBJECTS) if seat not in kept.values()]
@@ -212,7 +214,7 @@ def follow_detected(
     mixtures = jax.vmap(filter.init)(keys)
     for t, still in enumerate(stills):
         boxes = Detections(detector.detect(still)[:MAX_DETECTIONS])
-        found = coloured(
+        found = with_colours(
             FrameDetections.of(boxes, f"detections: frame {t + 1}", still.shape[:2]), still
         )
         means = jax.tree.map(np.asarray, _moments(mixtures))
@@ -255,7 +257,7 @@ def _moments(mixtures: ParticleMixture) -> Gaussian:
 def _advance(filter, keys, t, mixtures, seen):
     def step(key, mixture, of_run):
         mixture, _ = filter.step(jax.random.fold_in(key, t), mixture, of_run)
-        place = mixture.component_averages(mixture.particles.place)
+        place = mixture.component_expectations(mixture.particles.place)
         boxes = jnp.concatenate([place[:, :2], jnp.exp(place[:, 2:])], axis=1)
         return mixture, boxes, mixture.particles.place[:, :2], mixture.component_indicators
 

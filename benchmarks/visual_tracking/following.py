@@ -53,7 +53,7 @@ def _advance(keys, filter, t, mixtures, frame):
         mixture, _ = filter.step(jax.random.fold_in(key, t), mixture, frame)
         places = filter.model.boxes(mixture.particles)
         labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
-        means = mixture.component_averages(places)
+        means = mixture.component_expectations(places)
         references = component_references(mixture)
         snapshot = Snapshot(means, mixture.active, places[:, :2], labels, references)
         return mixture, snapshot

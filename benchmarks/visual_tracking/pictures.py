@@ -43,7 +43,7 @@ def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snap
     shown = [snapshots[t] for snapshots in tracked.values() for t in chosen]
     held = [s.points[0][s.labels[0] >= 0] for s in shown]
     points = [np.quantile(each, (0.1, 0.9), axis=0) for each in held if len(each)]
-    points = np.concatenate([*points, box_files.centred(source.boxes)[:, :2]])
+    points = np.concatenate([*points, box_files.to_centre(source.boxes)[:, :2]])
     crop = region(points, source.boxes[:, 2:], stills[0].shape)
     zoom = max(1, round(900 / (crop[1].stop - crop[1].start)))
     columns = [

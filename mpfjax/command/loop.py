@@ -46,7 +46,7 @@ class Results:
         self.ahead, self.clock = Clock("read", "detect"), Clock("track")
         self.last = Clock("write", "wait")
         self.rows: list[np.ndarray] = []
-        self.kept: list[Tracks] = []  # for --offline alone
+        self.offline_tracks: list[Tracks] = []  # for --offline alone
         self.times: list[float] = []  # of the frames of a video
         self.num_frames = 0
         self.without_room = 0  # frames with more objects than there is room for
@@ -57,7 +57,7 @@ class Results:
         rows = _with_sizes(online_rows(tracks, described=True))
         self.rows.append(rows)
         if self.options.offline:
-            self.kept.append(tracks)
+            self.offline_tracks.append(tracks)
         self.num_frames += 1
         self.without_room += bool(tracks.full)
         self.left_out += tracks.left_out
@@ -66,7 +66,7 @@ class Results:
     def all_rows(self) -> np.ndarray:
         """The rows of tracks.txt, with scores and classes."""
         if self.options.offline:
-            return _with_sizes(offline_rows(self.kept, described=True))
+            return _with_sizes(offline_rows(self.offline_tracks, described=True))
         return np.concatenate([np.zeros((0, 8)), *self.rows])
 
     def summary(self) -> dict[str, Any]:
@@ -78,7 +78,7 @@ class Results:
             "objects": len(np.unique(rows[:, 1])),
             "frames_without_room": self.without_room,
             "detections_left_out": self.left_out,
-            "seconds": {part: round(taken, 3) for part, taken in seconds.items()},
+            "seconds": {part: round(duration, 3) for part, duration in seconds.items()},
             "frames_per_second": round(n / max(self.clock.seconds["track"], 1e-9), 2),
             "peak_memory_mb": round(peak_memory(), 1),
         }
@@ -180,7 +180,7 @@ def _track(results: Results, start: Start) -> None:
     untracked: collections.deque[np.ndarray | None] = collections.deque()
     has_video = source.has_pixels and not options.no_video
 
-    def watched(stills: Iterator[Any]) -> Iterator[Any]:
+    def record(stills: Iterator[Any]) -> Iterator[Any]:
         for still in results.ahead.over("read", stills):
             untracked.append(still)
             yield still
@@ -207,7 +207,7 @@ def _track(results: Results, start: Start) -> None:
         if source.has_pixels:
             path, times = source.path, results.times
             read = frames.read_frames(path, source.first, source.last, times=times)
-            stills = watched(opened.enter_context(read_ahead(read)))
+            stills = record(opened.enter_context(read_ahead(read)))
             # Two threads take twice the processor's time for pictures as small as those of optical
             # flow, and none less by the clock; what detects is best divided among processors.
             if not options.detect and has_opencv():
@@ -228,5 +228,5 @@ def _line(summary: dict[str, Any]) -> str:
     """The numbers of the summary that are worth a look."""
     names = {"frames_per_second": "frames a second", "peak_memory_mb": "MB at most"}
     columns = ["frames", "objects", *names, *SCORES]
-    told = (f"{summary[name]:g} {names.get(name, name)}" for name in columns if name in summary)
-    return ", ".join(told)
+    parts = (f"{summary[name]:g} {names.get(name, name)}" for name in columns if name in summary)
+    return ", ".join(parts)

@@ -64,17 +64,17 @@ def check_options(track: argparse.ArgumentParser, options: argparse.Namespace) -
     """An error of `track` for options that do not go together."""
     by_pixels, has_pixels = options.camera_motion == "pixels", _has_pixels(options.source)
     of_pixels = {"detect": options.detect, "box": options.box, "camera-motion pixels": by_pixels}
-    for name, given in of_pixels.items():
-        if given and not has_pixels:
+    for name, value in of_pixels.items():
+        if value and not has_pixels:
             track.error(f"argument --{name}: {options.source} has no pixels")
     if has_pixels and not (options.detections or options.detect or options.box):
         track.error("one of the arguments --detections --detect --box is required")
     if options.detect and by_pixels:
         track.error("argument --camera-motion pixels: not allowed with --detect")
-    for given, others in _NOT_WITH.items():
-        for name in others if getattr(options, given) else ():
+    for option, others in _NOT_WITH.items():
+        for name in others if getattr(options, option) else ():
             if getattr(options, name) not in (None, False):
-                names = (each.replace("_", "-") for each in (name, given))
+                names = (each.replace("_", "-") for each in (name, option))
                 track.error("argument --{}: not allowed with --{}".format(*names))
 
 
@@ -101,19 +101,19 @@ def open_source(options: argparse.Namespace) -> Source:
     unscored, end = points or options.box is not None, last
     truth = None if unscored else find_truth(folder, options.truth, first, last)
     if rows is not None and not has_pixels:
-        known = [rows[:, :6], *([] if truth is None else [truth.objects])]
-        held = last_frame(info, *known)
+        rows_of_files = [rows[:, :6], *([] if truth is None else [truth.objects])]
+        length = last_frame(info, *rows_of_files)
         if last is None and info.length is None:
             begin = first if options.frames else None
             rate = options.fps or info.frame_rate or 25
-            of_rows = Rows(np.concatenate(known), coordinates=2 if points else 4)
+            of_rows = Rows(np.concatenate(rows_of_files), coordinates=2 if points else 4)
             first = first_step(of_rows, begin, rate)
-        last = end = min(last or held, held)
+        last = end = min(last or length, length)
         if last < first:
-            raise ValueError(f"SOURCE: {path} holds {held} frames, and no frame {first}")
+            raise ValueError(f"SOURCE: {path} holds {length} frames, and no frame {first}")
     elif path.is_dir():
-        held = frames.num_images(path)
-        end = min(last or held, held)
+        length = frames.num_images(path)
+        end = min(last or length, length)
     num_frames = None if end is None else end - first + 1
     if rows is not None and options.frames is not None and last is not None:
         rows = rows[rows[:, 0] <= last]
@@ -121,26 +121,26 @@ def open_source(options: argparse.Namespace) -> Source:
     return Source(path, has_pixels, rows, first, last, num_frames, rate, info.size, truth)
 
 
-def find_truth(source: Path, given: Path | None, first: int, last: int | None) -> Truth | None:
-    """The truth that was given, or that of a folder of images, in these frames; None without one.
+def find_truth(source: Path, path: Path | None, first: int, last: int | None) -> Truth | None:
+    """The ground truth at `path`, or in a folder of images, in these frames; None without one.
 
-    A video has no folder, and so no truth unless it is given. Warns of a truth beside the images
-    that cannot be read; raises `ValueError` for a given one.
+    A video has no folder, and so no ground truth without a `path`. Warns of a file in the folder
+    that cannot be read; raises `ValueError` for a file at `path`.
     """
-    if given is None and not source.is_dir():
+    if path is None and not source.is_dir():
         return None
     folder = Path(os.path.abspath(source))
     try:
-        truth = read_truth(given or (folder.parent if folder.name in _INNER else folder))
+        truth = read_truth(path or (folder.parent if folder.name in _INNER else folder))
     except (ValueError, OSError) as error:
-        if given is not None:
+        if path is not None:
             raise
         if not isinstance(error, FileNotFoundError):
             warnings.warn(f"{NO_SCORES}: {error}", RuntimeWarning, stacklevel=2)
         return None
     truth = truth.between(first, last or np.inf)
-    if given is not None and not len(truth.objects):
-        raise ValueError(f"--truth: {given} has no box in these frames")
+    if path is not None and not len(truth.objects):
+        raise ValueError(f"--truth: {path} has no box in these frames")
     return truth if len(truth.objects) else None
 
 

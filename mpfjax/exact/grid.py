@@ -86,10 +86,10 @@ def _checked_grid(grid: Any) -> tuple[Float[Array, " g"], Any]:
     points = real_array("points", "grid", grid)
     width = _width(grid)
     if not isinstance(points, Tracer):
-        known = np.asarray(points)  # within a caller's jit, too
-        even = float(known[0]) + width * np.arange(len(known))
-        rounding = 4 * np.finfo(known.dtype).eps * np.abs(even).max()
-        if not (width > rounding and np.abs(known - even).max() <= rounding):
+        values = np.asarray(points)  # within a caller's jit, too
+        even = float(values[0]) + width * np.arange(len(values))
+        rounding = 4 * np.finfo(values.dtype).eps * np.abs(even).max()
+        if not (width > rounding and np.abs(values - even).max() <= rounding):
             raise ValueError(f"grid: {shown(grid)} does not ascend in even steps")
     return points, width
 
@@ -114,18 +114,18 @@ def _grid_filter(model, series, grid, width, state_shape):
     def advance(
         probabilities: Float[Array, " g"], now: Series
     ) -> tuple[Float[Array, " g"], tuple[Float[Array, " g"], Float[Array, ""]]]:
-        given = with_inputs(model, now.inputs)
-        kernel = kernel_of(given) if shared is None else shared
+        model_now = with_inputs(model, now.inputs)
+        kernel = kernel_of(model_now) if shared is None else shared
         predicted = jnp.matmul(probabilities, kernel, precision="highest")
-        log_factors = law_of(given).log_likelihood(now.observations, states)
+        log_factors = law_of(model_now).log_likelihood(now.observations, states)
         if now.present is not None:
             log_factors = jnp.where(now.present, log_factors, 0.0)
         log_joint = log_or_nothing(predicted) + log_factors
         increment = log_sum_exp(log_joint)
         if now.present is not None:
             increment = jnp.where(now.present, increment, 0.0)
-        updated = softmax(log_joint)
-        return updated, (updated, increment)
+        posterior = softmax(log_joint)
+        return posterior, (posterior, increment)
 
     _, (probabilities, increments) = jax.lax.scan(advance, softmax(log_prior), series)
     return GridFilterRun(grid, probabilities, increments, jnp.sum(increments))

@@ -14,9 +14,9 @@ from mpfjax.models.linear import LinearGaussianModel
 from mpfjax.models.observations import (
     NOT_FINITE,
     Series,
-    gathered,
     numpy_for,
     present_steps,
+    series_of,
     steps_of_inputs,
     with_gaps,
 )
@@ -97,7 +97,7 @@ def kalman_smoother(model: LinearGaussianModel, observations: PyTree) -> KalmanS
 
 
 def _checked(model: Any, data: PyTree) -> tuple[Any, PyTree]:
-    series = gathered(data)
+    series = series_of(data)
     rows = checked_rows(series, model.H.shape[0], model.m0.dtype)
     return rows, steps_of_inputs(series.inputs, rows.shape[0], model)
 
@@ -115,19 +115,19 @@ def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Any:
 @eqx.filter_jit
 def _kalman_filter(constant, observations, inputs):
     """Means and covariances of x_1, ..., x_t, and the increments."""
-    laws, increments = filtered(*_begun(constant), inputs, observations)
+    laws, increments = filtered(*_initial_law_and_steps(constant), inputs, observations)
     return laws.moments, increments
 
 
 @eqx.filter_jit
 def _smooth(constant, observations, inputs):
-    start, step_of = _begun(constant)
+    start, step_of = _initial_law_and_steps(constant)
     laws, increments = filtered(start, step_of, inputs, observations)
     moments, lagged = smoothed(start, laws, step_of, inputs)
     return KalmanSmootherRun(*moments, lagged, jnp.sum(increments))
 
 
-def _begun(constant: LinearGaussianModel) -> tuple["Law", StepOf]:
+def _initial_law_and_steps(constant: LinearGaussianModel) -> tuple["Law", StepOf]:
     """The law of x_0, and the matrices of a step by its inputs."""
 
     def step_of(now: PyTree) -> LinearStep:
@@ -154,10 +154,10 @@ class Law(NamedTuple):
     @property
     def moments(self) -> Moments:
         """Mean and covariance."""
-        return self.mean, _squared(self.unit, self.variances)
+        return self.mean, _covariance(self.unit, self.variances)
 
 
-def _squared(rows: Float[Array, "*t n k"], variances: Float[Array, "*t k"]) -> Array:
+def _covariance(rows: Float[Array, "*t n k"], variances: Float[Array, "*t k"]) -> Array:
     """A diag(D) Aᵀ, a sum of terms none of which is negative on the diagonal."""
     return jnp.einsum("...ik,...k,...jk->...ij", rows, variances, rows)
 
@@ -231,23 +231,24 @@ def _regression(rows: Float[Array, "n k"], noise: Float[Array, " k"], on: int) -
 
 
 def filtered(
-    start: Law, step_of: StepOf, told: PyTree, observations: Float[Array, "t p"]
+    start: Law, step_of: StepOf, step_data: PyTree, observations: Float[Array, "t p"]
 ) -> tuple[Law, Float[Array, " t"]]:
     """The laws of x_1, ..., x_t, and the increments; a NaN is a missing number.
 
-    `step_of` makes the matrices of each step from its part of `told`, which has a leading axis t.
+    `step_of` makes the matrices of each step from its part of `step_data`, of leading axis t.
     (x_t, y_t) is a matrix times independent noises, those of x_{t-1}, of the dynamics and of y_t.
     """
 
     def advance(law: Law, of_step: tuple[Array, PyTree]) -> tuple[Law, Any]:
         observation, now = of_step
         step, d = step_of(now), law.mean.shape[0]
-        seen = ~jnp.isnan(observation)
+        is_present = ~jnp.isnan(observation)
         # A missing number becomes one with H = 0, variance one and no error.
-        H = jnp.where(seen[:, None], step.H, 0.0)
-        R = jnp.where(seen[:, None] & seen[None], step.R, jnp.eye(*step.R.shape, dtype=H.dtype))
+        H = jnp.where(is_present[:, None], step.H, 0.0)
+        both = is_present[:, None] & is_present[None]
+        R = jnp.where(both, step.R, jnp.eye(*step.R.shape, dtype=H.dtype))
         mean = step.F @ law.mean + step.b
-        innovation = jnp.where(seen, observation - step.c, 0.0) - H @ mean
+        innovation = jnp.where(is_present, observation - step.c, 0.0) - H @ mean
         units, variances = _factors(jax.scipy.linalg.block_diag(step.Q, R))
         moved = jnp.concatenate([step.F @ law.unit, units[:d]], axis=1)
         of_observation = jnp.pad(units[d:], ((0, 0), (d, 0)))
@@ -256,11 +257,11 @@ def filtered(
         _, unit, variances = _regression(rows, noise, rows.shape[0])
         errors, spread = _solve_unit(unit[d:, d:], innovation), variances[d:]
         increment = -0.5 * jnp.sum(errors**2 / spread + jnp.log(spread))
-        increment -= 0.5 * jnp.sum(seen).astype(H.dtype) * jnp.log(2 * jnp.pi)
+        increment -= 0.5 * jnp.sum(is_present).astype(H.dtype) * jnp.log(2 * jnp.pi)
         law = Law(mean + unit[:d, d:] @ errors, unit[:d, :d], variances[:d])
         return law, (law, increment)
 
-    return jax.lax.scan(advance, start, (observations, told))[1]
+    return jax.lax.scan(advance, start, (observations, step_data))[1]
 
 
 def _solve_unit(unit: Float[Array, "m m"], right: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
@@ -269,7 +270,7 @@ def _solve_unit(unit: Float[Array, "m m"], right: Float[Array, "m ..."]) -> Floa
 
 
 def smoothed(
-    start: Law, laws: Law, step_of: StepOf, told: PyTree
+    start: Law, laws: Law, step_of: StepOf, step_data: PyTree
 ) -> tuple[Moments, Float[Array, "t d d"]]:
     """The moments of x_0, ..., x_t given y_1..y_t, and Cov[x_s, x_{s-1}]; `laws` are filtered.
 
@@ -286,12 +287,12 @@ def smoothed(
         left, unit, _ = _regression(rows, noise, d)
         gain = unit[:d] @ _solve_unit(unit[d:], jnp.eye(d, dtype=unit.dtype))
         mean = law.mean + gain @ (later_mean - (step.F @ law.mean + step.b))
-        covariance = _squared(left, noise) + gain @ later_covariance @ gain.T
+        covariance = _covariance(left, noise) + gain @ later_covariance @ gain.T
         return (mean, covariance), (mean, covariance, later_covariance @ gain.T)
 
     last = jax.tree.map(lambda rows: rows[-1], laws.moments)
     earlier = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows[:-1]]), start, laws)
-    _, (*before, lagged) = jax.lax.scan(back, last, (earlier, told), reverse=True)
+    _, (*before, lagged) = jax.lax.scan(back, last, (earlier, step_data), reverse=True)
     means, covariances = (
         jnp.concatenate([rows, row[None]]) for rows, row in zip(before, last, strict=True)
     )

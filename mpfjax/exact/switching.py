@@ -16,7 +16,7 @@ from mpfjax.exact.kalman import (
     smoothed,
 )
 from mpfjax.models.linear import SwitchingLinearGaussianModel
-from mpfjax.models.observations import gathered, steps_of_inputs
+from mpfjax.models.observations import series_of, steps_of_inputs
 from mpfjax.operations.logarithms import log_sum_exp
 
 
@@ -54,18 +54,18 @@ def switching_filter(
     observations that are not (t, p), and for more than a million sequences. Use it as the reference
     for a short series.
     """
-    series = gathered(observations)
+    series = series_of(observations)
     rows = checked_rows(series, model.H.shape[-2], model.m0.dtype)
     length, k = rows.shape[0], model.num_regimes
     steps_of_inputs(series.inputs, length, model)
     if k ** (length + 1) > _MOST_SEQUENCES:
         number = f"{k}^{length + 1} sequences, more than {_MOST_SEQUENCES}"
         raise ValueError(f"observations: {length} steps of {k} regimes are {number}")
-    return _enumerated(model, rows)
+    return _enumerate_sequences(model, rows)
 
 
 @eqx.filter_jit
-def _enumerated(
+def _enumerate_sequences(
     model: SwitchingLinearGaussianModel, observations: Float[Array, "t p"]
 ) -> SwitchingFilterRun:
     k, length = model.num_regimes, observations.shape[0]
@@ -80,9 +80,9 @@ def _enumerated(
     log_evidence = jax.vmap(log_sum_exp)(log_weights.T)
     weights = jnp.exp(log_weights - log_evidence[None])
     is_regime = jax.nn.one_hot(sequences, k, dtype=weights.dtype)
-    means, covariances = _mixed(weights, *of_filter)
+    means, covariances = _mixture_moments(weights, *of_filter)
     final = jnp.broadcast_to(weights[:, -1:], (len(places), length + 1))
-    smoothed_means, smoothed_covariances = _mixed(final, *of_smoother)
+    smoothed_means, smoothed_covariances = _mixture_moments(final, *of_smoother)
     increments = jnp.diff(log_evidence, prepend=jnp.zeros(1, log_evidence.dtype))
     return SwitchingFilterRun(
         regime_probabilities=jnp.einsum("st,stk->tk", weights, is_regime[:, 1:]),
@@ -96,7 +96,7 @@ def _enumerated(
     )
 
 
-def _mixed(
+def _mixture_moments(
     weights: Float[Array, "s t"], means: Float[Array, "s t d"], covariances: Float[Array, "s t d d"]
 ) -> tuple[Float[Array, "t d"], Float[Array, "t d d"]]:
     """The moments of a mixture of Gaussians at each time."""

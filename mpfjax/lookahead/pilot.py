@@ -12,7 +12,7 @@ from mpfjax.models.base import require_noise
 from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.moves.base import AbstractProposal, Given, Step
-from mpfjax.moves.initial import trusted
+from mpfjax.moves.initial import selection_weights
 
 
 class AbstractLookahead(Given):
@@ -61,7 +61,7 @@ class PilotLookahead(AbstractLookahead):
             for noise in (ones, -ones)
         ]
         # Any ν is exact, so that its derivative is not needed.
-        return jax.lax.stop_gradient(jnp.log(trusted(jnp.stack(looks), mixture.weights)))
+        return jax.lax.stop_gradient(jnp.log(selection_weights(jnp.stack(looks), mixture.weights)))
 
 
 Lookahead = AbstractProposal | AbstractLookahead | Callable[[PyTree, PyTree], Array]

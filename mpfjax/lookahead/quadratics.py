@@ -14,7 +14,7 @@ from mpfjax.operations.matrices import (
     coordinates,
     inner,
     log_total,
-    transformed,
+    transform,
 )
 
 Index = Int[Array, ""]
@@ -80,29 +80,31 @@ class LocalQuadratics(eqx.Module):
         undisturbed = self.defence + (1 - self.defence) * jnp.exp(self.log_floor - log_sum)
 
         def draw_of(k: Index) -> Coordinates:
-            own = transformed(self.noise_factors[k], standard, is_lower=True)
-            return [mean + part for mean, part in zip(self._mean(k, states), own, strict=True)]
+            deviations = transform(self.noise_factors[k], standard, is_lower=True)
+            return [
+                mean + part for mean, part in zip(self._mean(k, states), deviations, strict=True)
+            ]
 
         of_experts = zip(*self._each(draw_of), strict=True)
         uniform = jax.scipy.special.ndtr(chooser)
         upto = list(itertools.accumulate(jnp.exp(log_share) for log_share in log_shares))
-        drawn = standard
+        noises = standard
         for limit, of_expert in reversed(list(zip(upto, of_experts, strict=True))):
-            drawn = [
-                jnp.where(uniform < limit, own, other)
-                for own, other in zip(of_expert, drawn, strict=True)
+            noises = [
+                jnp.where(uniform < limit, new, old)
+                for new, old in zip(of_expert, noises, strict=True)
             ]
-        norm = inner(drawn, drawn)
+        norm = inner(noises, noises)
 
         def log_ratio_of(k: Index) -> Float[Array, " n"]:
-            away = [x - mean for x, mean in zip(drawn, self._mean(k, states), strict=True)]
-            residuals = transformed(self.noise_whitening[k], away, is_lower=True)
+            away = [x - mean for x, mean in zip(noises, self._mean(k, states), strict=True)]
+            residuals = transform(self.noise_whitening[k], away, is_lower=True)
             log_volume = jnp.sum(jnp.log(jnp.diagonal(self.noise_whitening[k])))
             return 0.5 * (norm - inner(residuals, residuals)) + log_volume
 
         ratios = zip(log_shares, self._each(log_ratio_of), strict=True)
         log_ratios = [log_share + log_ratio for log_share, log_ratio in ratios]
-        return jnp.stack(drawn, axis=1), -log_total([*log_ratios, jnp.log(undisturbed)])
+        return jnp.stack(noises, axis=1), -log_total([*log_ratios, jnp.log(undisturbed)])
 
     def whitened(self, features: Float[Array, "n d"]) -> Float[Array, "k d n"]:
         """z_k of each particle, the particles last."""
@@ -141,7 +143,7 @@ class LocalQuadratics(eqx.Module):
         radius = jnp.sqrt(jnp.maximum(square, 1e-12))
         inwards = jnp.minimum(1.0, most / radius)
         within = [inwards * x for x in z]
-        curved = transformed(self.curvatures[k], within)
+        curved = transform(self.curvatures[k], within)
         bent = [self.slopes[k, i] + 0.5 * x for i, x in enumerate(curved)]
         log_normaliser = jnp.minimum(self.constants[k] + inner(bent, within), self.log_cap)
         beyond = jnp.maximum(radius - most, 0.0)
@@ -150,11 +152,11 @@ class LocalQuadratics(eqx.Module):
     def _whitened(self, k: Index, points: Coordinates) -> Coordinates:
         """z_k."""
         centred = [x - self.centres[k, i] for i, x in enumerate(points)]
-        return transformed(self.whitening[k], centred, is_lower=True)
+        return transform(self.whitening[k], centred, is_lower=True)
 
     def _mean(self, k: Index, points: Coordinates) -> Coordinates:
         """m_k(x)."""
-        moved = transformed(self.noise_slopes[k], self._whitened(k, points))
+        moved = transform(self.noise_slopes[k], self._whitened(k, points))
         return [self.noise_means[k, i] + x for i, x in enumerate(moved)]
 
     def _each(self, function: Callable[[Index], PyTree]) -> PyTree:

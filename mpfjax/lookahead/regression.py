@@ -101,7 +101,7 @@ def _draw_points(
     num_coefficients = _num_coefficients(dimension + num_noises)
     needed = _PARTICLES_A_COEFFICIENT * num_coefficients
     copies = -(-2 * needed * num_experts // mixture.num_particles)
-    repeated = mixture.repeated(copies)
+    repeated = mixture.repeat(copies)
     states, log_weights = repeated.particles, repeated.log_weights
     features = twist.features_of(states)
     shape = (len(log_weights), num_noises + 1)
@@ -137,18 +137,20 @@ def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
     weights = weights / jnp.maximum(jnp.sum(weights, axis=0), 1e-30)[None]
 
     def fit(of_expert: tuple[Array, Array]) -> tuple[dict[str, Array], Array]:
-        quadratic, missed = _regressed(*of_expert, points.noise, points.targets)
-        return _integrated(*quadratic, points.noise.shape[1]), missed
+        quadratic, square_error = _fit_quadratic(*of_expert, points.noise, points.targets)
+        return _integrate_noise(*quadratic, points.noise.shape[1]), square_error
 
     whitened = jnp.swapaxes(located.whitened(points.features), 1, 2)
-    experts, missed = jax.lax.map(fit, (weights.T, whitened))
-    missed = jnp.sum(jnp.where(alive, missed, 0.0)) / _count(alive, points.targets.dtype)
+    experts, square_error = jax.lax.map(fit, (weights.T, whitened))
+    square_error = jnp.sum(jnp.where(alive, square_error, 0.0)) / _count(
+        alive, points.targets.dtype
+    )
     return replace(
         located,
         **experts,
         noise_whitening=_inverses(experts["noise_factors"]),
         log_cap=jnp.max(points.targets),
-        defence=jnp.clip(missed, _LEAST_DEFENCE, _MOST_DEFENCE),
+        defence=jnp.clip(square_error, _LEAST_DEFENCE, _MOST_DEFENCE),
     )
 
 
@@ -192,12 +194,12 @@ def _fit_initial(
     )
     log_weights = draw(key_fitted, fitted)[2]
     log_sum, log_squares = (jax.nn.logsumexp(power * log_weights) for power in (1, 2))
-    missed = size * jnp.exp(log_squares - 2 * log_sum) - 1
-    return replace(fitted, defence=jnp.clip(missed, _LEAST_DEFENCE, _MOST_DEFENCE))
+    square_error = size * jnp.exp(log_squares - 2 * log_sum) - 1
+    return replace(fitted, defence=jnp.clip(square_error, _LEAST_DEFENCE, _MOST_DEFENCE))
 
 
 def _tempered(
-    log_importance: Float[Array, " n"], members: Float[Array, "n k"], needed: float
+    log_importance: Float[Array, " n"], members: Float[Array, "n k"], num_needed: float
 ) -> Float[Array, "n k"]:
     """w_i^α of each expert's members, with the largest α up to 1 with a large enough sample."""
     is_member = (members > 0) & (log_importance > -jnp.inf)[:, None]
@@ -212,15 +214,15 @@ def _tempered(
         return jnp.sum(members * values, axis=0) ** 2 / jnp.maximum(squares, 1e-30)
 
     low, high = jnp.zeros_like(most), jnp.ones_like(most)
-    goal = jnp.minimum(needed, 0.5 * size(low))
+    goal = jnp.minimum(num_needed, 0.5 * size(low))
 
-    def halved(_: Any, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+    def bisect(_: Any, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds
         middle = 0.5 * (low + high)
         enough = size(middle) >= goal
         return jnp.where(enough, middle, low), jnp.where(enough, high, middle)
 
-    tempered, _ = jax.lax.fori_loop(0, _HALVINGS, halved, (low, high))
+    tempered, _ = jax.lax.fori_loop(0, _HALVINGS, bisect, (low, high))
     return members * jnp.exp(jnp.where(size(high) >= goal, 1.0, tempered)[None] * logs)
 
 
@@ -233,16 +235,16 @@ def _moments(
     spread = jnp.std(values, axis=0)
     unit = jnp.where(spread > 0, spread, 1.0)
 
-    def moments(own: Float[Array, " n"]) -> tuple[Array, Array]:
-        mean = own @ values
+    def moments(column: Float[Array, " n"]) -> tuple[Array, Array]:
+        mean = column @ values
         scaled = (values - mean[None]) / unit[None]
-        covariance = (scaled * own[:, None]).T @ scaled
+        covariance = (scaled * column[:, None]).T @ scaled
         return mean, unit[:, None] * _factor(covariance)
 
     return jax.vmap(moments)(weights.T)
 
 
-def _regressed(
+def _fit_quadratic(
     weights: Float[Array, " n"],
     whitened: Float[Array, "n d"],
     noise: Float[Array, "n j"],
@@ -271,24 +273,24 @@ def _regressed(
     rough = jnp.linalg.solve(normal + _RIDGE * ridge, right)
     # The better the fit and the larger the sample, the less it is regularised.
     noisy = weights @ (targets - level - design @ rough) ** 2 * jnp.sum(weights**2)
-    held = _RIDGE * ridge + noisy * ridge.at[0, 0].set(0.0)
-    coefficients = jnp.linalg.solve(normal + held, right)
+    penalty = _RIDGE * ridge + noisy * ridge.at[0, 0].set(0.0)
+    coefficients = jnp.linalg.solve(normal + penalty, right)
     slope, upper = coefficients[1 : 1 + size], coefficients[1 + size :]
     upper = jnp.where(is_square, root * upper, upper)
     hessian = jnp.zeros((size, size), dtype).at[rows, columns].set(upper)
     values_, vectors = jnp.linalg.eigh(hessian + jnp.triu(hessian, 1).T)
     hessian = (vectors * jnp.minimum(values_, 0.0)[None]) @ vectors.T
     constant = level + coefficients[0] - 0.5 * jnp.trace(hessian)
-    curved = 0.5 * jnp.sum((standard @ hessian) * standard, axis=1)
-    residuals = targets - constant - standard @ slope - curved
+    curvature = 0.5 * jnp.sum((standard @ hessian) * standard, axis=1)
+    residuals = targets - constant - standard @ slope - curvature
     constant = constant + weights @ residuals
-    missed = weights @ residuals**2 - (weights @ residuals) ** 2
+    square_error = weights @ residuals**2 - (weights @ residuals) ** 2
     hessian, slope = inverse.T @ hessian @ inverse, inverse.T @ slope
     constant = constant - slope @ mean + 0.5 * mean @ hessian @ mean
-    return (constant, slope - hessian @ mean, hessian), missed
+    return (constant, slope - hessian @ mean, hessian), square_error
 
 
-def _integrated(
+def _integrate_noise(
     constant: Float[Array, ""],
     slope: Float[Array, " z"],
     hessian: Float[Array, "z z"],
@@ -314,9 +316,9 @@ def _integrated(
 
 
 def _if_finite(psi: LocalQuadratics, before: LocalQuadratics) -> LocalQuadratics:
-    """ψ, or that of before where the fit has a NaN."""
+    """ψ, or the earlier ψ where the fit has a NaN."""
     broken = jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(psi)]))
-    return jax.tree.map(lambda own, other: jnp.where(broken, other, own), psi, before)
+    return jax.tree.map(lambda new, old: jnp.where(broken, old, new), psi, before)
 
 
 def _num_coefficients(dimension: int) -> int:

@@ -80,7 +80,7 @@ class TwistInitial(AbstractMove):
         drawn, log_ratio = psi.draw(noise, jnp.zeros((shape[0], 1), dtype))
         states = with_moments(model, model.initial_from_noise(drawn))
         check_moved(states, mixture.particles, model, "initial_from_noise")
-        return mixture.replace(particles=states).weighed(log_ratio)
+        return mixture.replace(particles=states).reweight(log_ratio)
 
 
 class PropagateTwisted(AbstractPropagation, AbstractWrapper):
@@ -105,9 +105,9 @@ class PropagateTwisted(AbstractPropagation, AbstractWrapper):
         noise = noise_of_slots(key, self.move.noise, dimension, mixture)
         psi = self.twist.at(mixture.t)
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
-        made = law.complete(law.make(drawn, previous), previous)
-        states, log_factors = law.see(now.observation, made)
-        return mixture.replace(particles=states).weighed(*log_factors, log_ratio)
+        states = law.complete(law.make(drawn, previous), previous)
+        states, log_factors = law.see(now.observation, states)
+        return mixture.replace(particles=states).reweight(*log_factors, log_ratio)
 
 
 class RegroupTwisted(AbstractWrapper, AbstractRegrouping):
@@ -127,6 +127,6 @@ class RegroupTwisted(AbstractWrapper, AbstractRegrouping):
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
         """The move's indicators under the weights times ν_{t+1}."""
         log_factors = self.twist.log_normaliser(mixture.t + 1, mixture)
-        log_weights = mixture.weighed(log_factors).log_weights
+        log_weights = mixture.reweight(log_factors).log_weights
         log_weights = log_weights - log_sum_exp(log_weights)
         return self.move.regroup(key, mixture.replace(log_weights=log_weights))

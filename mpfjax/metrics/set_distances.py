@@ -71,8 +71,8 @@ def ospa(
     an exponent below 1 or infinite. Use it for an error per object; `gospa` reports how many
     objects were missed.
     """
-    shares, found, there = _paired(estimates, truths, cutoff, exponent)
-    size, num_alone = max(found, there, 1), abs(found - there)
+    shares, num_estimates, num_truths = _pair(estimates, truths, cutoff, exponent)
+    size, num_alone = max(num_estimates, num_truths, 1), abs(num_estimates - num_truths)
     return OSPA(
         distance=cutoff * _norm(shares, num_alone, exponent) / size ** (1 / exponent),
         localisation=float(np.sum((cutoff * shares) ** exponent)) / size,
@@ -100,14 +100,14 @@ def gospa(
     Raises `ValueError` as `ospa` does. Use it to score trackers that may lose objects or report
     false ones.
     """
-    shares, found, there = _paired(estimates, truths, cutoff, exponent)
+    shares, num_estimates, num_truths = _pair(estimates, truths, cutoff, exponent)
     near, num_far = shares[~(shares >= 1)], np.sum(shares >= 1)
     missed, false = (
         _times(num_far / 2 + max(number - len(shares), 0) / 2, cutoff, exponent)
-        for number in (there, found)
+        for number in (num_truths, num_estimates)
     )
     return GOSPA(
-        distance=cutoff * _norm(shares, abs(found - there) / 2, exponent),
+        distance=cutoff * _norm(shares, abs(num_estimates - num_truths) / 2, exponent),
         localisation=float(np.sum((cutoff * near) ** exponent)),
         missed=missed,
         false=false,
@@ -126,7 +126,7 @@ def _times(share: float, cutoff: float, exponent: float) -> float:
     return float(share * np.float64(cutoff) ** exponent) if share > 0 else 0.0
 
 
-def _paired(
+def _pair(
     estimates: Any, truths: Any, cutoff: float, exponent: float
 ) -> tuple[Float[np.ndarray, " s"], int, int]:
     """The distances of the cheapest pairing, in units of the cutoff, at most one; both numbers.
@@ -135,9 +135,9 @@ def _paired(
     which the powers of those that compete are numbers that it can add. A distance of the cutoff, or
     one of more than all of these together, costs `most`: how much more makes no difference.
     """
-    found = to_rows(None, "estimates", estimates)
-    there = to_rows(found.shape[1], "truths", truths)
-    distances = np.minimum(cdist(found, there) / cutoff, 1.0)
+    estimates = to_rows(None, "estimates", estimates)
+    truths = to_rows(estimates.shape[1], "truths", truths)
+    distances = np.minimum(cdist(estimates, truths) / cutoff, 1.0)
     if np.isnan(distances).any():
         return np.full(min(distances.shape), np.nan), *distances.shape
     unit, most = 1.0, min(distances.shape) + 1.0

@@ -61,7 +61,7 @@ class AbstractStateSpaceModel(eqx.Module):
         A model may override it, so that any of its parameters varies in time. It is called while
         JAX traces a step, so it must not use the values of u_t in Python.
         """
-        return replaced(self, inputs=inputs)
+        return replace_fields(self, inputs=inputs)
 
     @abc.abstractmethod
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
@@ -98,22 +98,22 @@ def with_inputs(model: Any, inputs: PyTree) -> Any:
         return model
     if hasattr(model, "with_inputs"):
         return model.with_inputs(inputs)
-    return replaced(model, inputs=inputs)
+    return replace_fields(model, inputs=inputs)
 
 
-def replaced(model: Any, /, **fields: Any) -> Any:
+def replace_fields(model: Any, /, **fields: Any) -> Any:
     """A copy of a model with some fields set, without checks or conversions."""
-    changed = object.__new__(type(model))
+    copy = object.__new__(type(model))
     for name, value in (vars(model) | fields).items():
-        object.__setattr__(changed, name, value)
-    return changed
+        object.__setattr__(copy, name, value)
+    return copy
 
 
 def is_made_of_noise(model: Any, state: str = "transition") -> bool:
     """Whether the model makes x_t of noise, or x_0 ("initial"), and has no other law for it."""
     drawing, making = f"sample_{state}", f"{state}_from_noise"
     size = "noise_dimension" if state == "transition" else "initial_noise_dimension"
-    kind = type(_own(model))
+    kind = type(_unwrap(model))
     # A class that draws a state itself may inherit how it is made of noise.
     owners = [owner for owner in kind.__mro__ if {drawing, making} & vars(owner).keys()]
     is_other = callable(getattr(kind, making, None)) and making not in vars(owners[0])
@@ -137,24 +137,26 @@ def require(model: Any, method: str, needed_by: str, argument: str = "model") ->
         raise ValueError(f"{argument}: a {type(model).__name__} is no model, and holds one, .model")
     if not callable(getattr(model, method, None)):
         who = shown(model) if model is None else model_name(model)
-        taken = {*_BATCHED, *_SHARED, *vars(AbstractStateSpaceModel)}
-        close = difflib.get_close_matches(method, vars(type(_own(model))).keys() - taken, 1)
+        library_names = {*_BATCHED, *_SHARED, *vars(AbstractStateSpaceModel)}
+        close = difflib.get_close_matches(
+            method, vars(type(_unwrap(model))).keys() - library_names, 1
+        )
         hint = f"; is {close[0]} meant for it?" if close else ""
         raise ValueError(f"{argument}: {who} defines no {method}, which {needed_by} needs{hint}")
 
 
 def model_name(model: Any) -> str:
     """The name of the user's own class, whether `per_particle` wraps it or not."""
-    return type(_own(model)).__name__
+    return type(_unwrap(model)).__name__
 
 
 @contextlib.contextmanager
-def asking(model: Any, method: str, given: str = "", value: Any = None) -> Iterator[None]:
+def asking(model: Any, method: str, argument: str = "", value: Any = None) -> Iterator[None]:
     """A block that calls a method of the model, whose errors say so, and what it was given."""
     try:
         yield
     except Exception:
-        clauses = [f"given {given} {shown(value)}"] if given else []
+        clauses = [f"given {argument} {shown(value)}"] if argument else []
         is_users = not type(model).__module__.startswith("mpfjax.")
         if getattr(model, "inputs", ()) is None and is_users:
             clauses.append("its inputs None, as the call gives no u_t")
@@ -162,13 +164,13 @@ def asking(model: Any, method: str, given: str = "", value: Any = None) -> Itera
             raise
 
 
-def _own(model: Any) -> Any:
+def _unwrap(model: Any) -> Any:
     return model.model if isinstance(model, _PerParticleModel) else model
 
 
 def innermost(model: Any) -> Any:
     """The user's own model, of one particle or of one object where it is wrapped."""
-    inner = getattr(model, "object_model", _own(model))
+    inner = getattr(model, "object_model", _unwrap(model))
     return model if inner is model else innermost(inner)
 
 
@@ -286,7 +288,7 @@ class _OverParticles:
         return jax.vmap(self.function)(*args)
 
 
-def mapped(model: Any, function: Any) -> Any:
+def over_particles(model: Any, function: Any) -> Any:
     """A function of the particles from one in the terms of the model: of one, or of all."""
     is_mapped = isinstance(function, _OverParticles) or not callable(function)
     if not isinstance(model, _PerParticleModel) or is_mapped:

@@ -17,8 +17,8 @@ from mpfjax.checks import SHARES
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     is_made_of_noise,
-    mapped,
-    replaced,
+    over_particles,
+    replace_fields,
     with_inputs,
 )
 from mpfjax.models.law import law_of, refuse_marginalised
@@ -85,7 +85,7 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
 
     def with_inputs(self, inputs: PyTree) -> "ClutteredModel":
         """The model whose object has u_t."""
-        return replaced(self, object_model=with_inputs(self.object_model, inputs))
+        return replace_fields(self, object_model=with_inputs(self.object_model, inputs))
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """x_0 of the object."""
@@ -115,16 +115,16 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
 
         # On a CPU, each fills the vectors by itself.
         odds = on_platform(
-            filled(observation),
+            fill_missing(observation),
             cpu=lambda rows: jax.lax.map(of_one, rows).T,
             default=jax.vmap(of_one, out_axes=1),
         )
-        return jnp.where(measured(observation)[None], odds, -jnp.inf)
+        return jnp.where(measurement_mask(observation)[None], odds, -jnp.inf)
 
     def detection(self, states: PyTree) -> Float[Array, " n"]:
         """p_D of each state."""
         p = self.detection_probability
-        p = mapped(self.object_model, p)(states) if callable(p) else p
+        p = over_particles(self.object_model, p)(states) if callable(p) else p
         return jnp.broadcast_to(p, jax.tree.leaves(states)[0].shape[:1]).astype(default_float())
 
     def __getattr__(self, name: str) -> Any:
@@ -136,13 +136,13 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
 
-def measured(observation: PyTree) -> Bool[Array, " k"]:
+def measurement_mask(observation: PyTree) -> Bool[Array, " k"]:
     """Which rows are measurements: those without a NaN."""
     leaves = map(jnp.isnan, jax.tree.leaves(observation))
     return ~jnp.any(jnp.stack([leaf.any(tuple(range(1, leaf.ndim))) for leaf in leaves]), axis=0)
 
 
-def filled(observation: PyTree) -> PyTree:
+def fill_missing(observation: PyTree) -> PyTree:
     """The rows with a number that no logarithm turns into one that is not finite in place of NaN.
 
     Nor is its gradient.

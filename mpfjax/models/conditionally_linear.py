@@ -17,14 +17,14 @@ from mpfjax.models.base import AbstractStateSpaceModel, check_moved, model_name,
 from mpfjax.models.gaussians import (
     Gaussian,
     Linear,
-    applied,
+    apply,
     cholesky,
     particles_first,
     particles_last,
     product,
     solve_lower,
     solve_upper,
-    transposed,
+    transpose,
 )
 from mpfjax.models.law import Law, law_of
 from mpfjax.models.noise import noise_dtype
@@ -131,7 +131,7 @@ class MarginalisedLaw(Law):
 
     def complete(self, draws: PyTree, states: PyTree) -> PyTree:
         """z_t with the moments of x_t predicted."""
-        return predicted(self.model, draws, states)
+        return predict(self.model, draws, states)
 
     def start(self, draws: PyTree) -> PyTree:
         """z_0 with the moments of x_0."""
@@ -140,7 +140,7 @@ class MarginalisedLaw(Law):
     def see(self, observation: PyTree, states: PyTree) -> tuple[PyTree, list[Float[Array, " n"]]]:
         """The moments given y_t too, and the factors of z and of x."""
         log_factors = [self.log_likelihood_of_draws(observation, states.latent)]
-        states, log_density = updated(self.model, observation, states)
+        states, log_density = update(self.model, observation, states)
         if log_density is not None:
             number = states.mean.shape[0]
             log_factors.append(real_each(log_density, number, self.model, "emission"))
@@ -215,7 +215,7 @@ def _initial_moments(model: Any, latent: PyTree) -> list[Array]:
     return _checked(model, "initial_moments", model.initial_moments(latent), n, m0="d", P0="d d")
 
 
-def predicted(model: Any, latent: PyTree, state: MarginalisedState) -> MarginalisedState:
+def predict(model: Any, latent: PyTree, state: MarginalisedState) -> MarginalisedState:
     """The moments of x_t given z_t and y_1..y_{t-1}, from those of x_{t-1}."""
     law = predicted_gaussian(model, latent, state)
     check_moved(latent, state.latent, model)
@@ -228,33 +228,33 @@ def _state_of(latent: PyTree, law: Gaussian, n: int) -> MarginalisedState:
 
 
 def predicted_gaussian(model: Any, latent: PyTree, state: MarginalisedState) -> Gaussian:
-    """The same with the particles last."""
+    """The predicted law of x_t given z_t, with the particles last."""
     law = filtered_gaussian(model, state)
     dynamics = dynamics_of(model, latent, state)
     if is_mixed(model):
         mixed, shared = latent_dynamics_of(model, state)
         law, _ = gaussians.update_by_all(law, latent_rows(model, latent), mixed)
-        dynamics = decorrelated(dynamics, mixed, shared, latent_rows(model, latent))
+        dynamics = decorrelate(dynamics, mixed, shared, latent_rows(model, latent))
     return gaussians.predict(law, dynamics)
 
 
-def decorrelated(
+def decorrelate(
     dynamics: Linear, mixed: Linear, shared: Float[Array, "d k n"] | None, latent: Array
 ) -> Linear:
     """The dynamics of x given z_t, where their noises are correlated: v is z_t - f - A x."""
     if shared is None:
         return dynamics
     factor = cholesky(mixed.noise, floor=True)
-    half = solve_lower(factor, transposed(shared))
-    slope = transposed(solve_upper(factor, half))
+    half = solve_lower(factor, transpose(shared))
+    slope = transpose(solve_upper(factor, half))
     return Linear(
         dynamics.matrix - product(slope, mixed.matrix),
-        dynamics.offset + applied(slope, latent - mixed.offset),
-        dynamics.noise - product(transposed(half), half),
+        dynamics.offset + apply(slope, latent - mixed.offset),
+        dynamics.noise - product(transpose(half), half),
     )
 
 
-def updated(
+def update(
     model: Any, observation: PyTree, state: MarginalisedState
 ) -> tuple[MarginalisedState, Float[Array, " n"] | None]:
     """The moments of x_t given y_t too, and log p(y_t | z, y_1..y_{t-1}); None if unobserved."""
@@ -271,7 +271,7 @@ def latent_from_noise(
 ) -> Float[Array, "n k"]:
     """z_t ~ N(f + A m, A P Aᵀ + V) of the mixed form, made of standard normal noise."""
     law = gaussians.predict(filtered_gaussian(model, state), latent_dynamics_of(model, state)[0])
-    drawn = law.mean + applied(cholesky(law.covariance), noise.T.astype(law.mean.dtype))
+    drawn = law.mean + apply(cholesky(law.covariance), noise.T.astype(law.mean.dtype))
     return drawn.T.reshape(state.latent.shape)
 
 
@@ -351,11 +351,11 @@ def latent_dynamics_of(
 
 
 def observation_rows(
-    model: Any, observation: PyTree, seen: Linear, dtype: jnp.dtype
+    model: Any, observation: PyTree, emission: Linear, dtype: jnp.dtype
 ) -> Float[Array, "p 1"]:
     """y_t as a column, checked."""
     numbers = as_numbers("observation", model.linear_observation(observation))
-    rows, p = jnp.atleast_1d(numbers).astype(dtype), seen.matrix.shape[0]
+    rows, p = jnp.atleast_1d(numbers).astype(dtype), emission.matrix.shape[0]
     check_shape(f"{p}", observation=rows)
     return jnp.reshape(rows, (p, 1))
 
@@ -368,6 +368,6 @@ def _checked(model: Any, method: str, parts: Any, n: int, **shapes: str) -> list
             fits &= isinstance(part, (array_of(shape), array_of(f"{n} {shape}")))
     if not fits:
         who = f"model: {model_name(model)}.{method}"
-        given = shown(jax.tree.map(jnp.shape, parts))
-        raise ValueError(f"{who} returned {given}, not {shapes}, or {n} of them")
+        actual = shown(jax.tree.map(jnp.shape, parts))
+        raise ValueError(f"{who} returned {actual}, not {shapes}, or {n} of them")
     return [jnp.asarray(part) for part in parts]

@@ -110,7 +110,7 @@ class RandomWalk(AbstractDynamics):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """That of `deviations`."""
+        """The shape of `deviations`."""
         return self.deviations.shape
 
     def expected(self, current: Rows, previous: Rows | None) -> Rows:
@@ -155,7 +155,7 @@ class RandomWalkWithJumps(RandomWalk):
         return self._step(jumps, noise[:, :-1])
 
     def sample_step(self, key: Key[Array, ""], num_rows: int, dtype: jnp.dtype) -> Rows:
-        """The same, from keys of their own for the jumps and the steps."""
+        """Steps drawn with separate keys for the jumps and for the noise."""
         key_noise, key_jump = split_once(key, 2)
         # In one row, which is drawn fast; the numbers are those of n rows.
         jumps = jax.random.bernoulli(fast_key(key_jump), self.jump_probability, (num_rows,))
@@ -208,12 +208,12 @@ class WalkWithVelocity(AbstractDynamics):
 
     @property
     def noise_dimension(self) -> int:
-        """That of the walk."""
+        """The number of coordinates of the walk's noise."""
         return self.walk.noise_dimension
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """That of the walk."""
+        """The shape of the walk."""
         return self.walk.shape
 
     def expected(self, current: Rows, previous: Any) -> Rows:
@@ -225,7 +225,7 @@ class WalkWithVelocity(AbstractDynamics):
         return self.walk.step(noise)
 
     def log_step(self, steps: Rows) -> Float[Array, " n"]:
-        """That of the walk."""
+        """The log density of the walk's steps."""
         return self.walk.log_step(steps)
 
     def sample_step(self, key: Key[Array, ""], num_rows: int, dtype: jnp.dtype) -> Rows:
@@ -282,7 +282,7 @@ class Autoregression(AbstractDynamics):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """That of the mean."""
+        """The shape of the mean."""
         return self.mean.shape
 
     def expected(self, current: Rows, previous: Any) -> Rows:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.operations.matrices import coordinates, total, transformed
+from mpfjax.operations.matrices import coordinates, total, transform
 from mpfjax.operations.stored import stored
 
 # The least variance, in units of the rounding error of the numbers it was computed from.
@@ -41,26 +41,26 @@ def product(left: Float[Array, "d k #n"], right: Float[Array, "k e #n"]) -> Floa
     return total
 
 
-def applied(matrix: Float[Array, "d k #n"], vector: Float[Array, "k #n"]) -> Float[Array, "d n"]:
+def apply(matrix: Float[Array, "d k #n"], vector: Float[Array, "k #n"]) -> Float[Array, "d n"]:
     """A v."""
     return product(matrix, vector[:, None])[:, 0]
 
 
-def transposed(matrix: Float[Array, "d e n"]) -> Float[Array, "e d n"]:
+def transpose(matrix: Float[Array, "d e n"]) -> Float[Array, "e d n"]:
     """Aᵀ."""
     return jnp.swapaxes(matrix, 0, 1)
 
 
 def symmetric(matrix: Float[Array, "d d n"]) -> Float[Array, "d d n"]:
     """(A + Aᵀ) / 2."""
-    return 0.5 * (matrix + transposed(matrix))
+    return 0.5 * (matrix + transpose(matrix))
 
 
-def sandwiched(
+def sandwich(
     matrix: Float[Array, "d k #n"], covariance: Float[Array, "k k #n"]
 ) -> Float[Array, "d d n"]:
     """A P Aᵀ, symmetric to the bit."""
-    return symmetric(product(product(matrix, covariance), transposed(matrix)))
+    return symmetric(product(product(matrix, covariance), transpose(matrix)))
 
 
 def cholesky(matrix: Float[Array, "d d #n"], floor: bool = False) -> Float[Array, "d d n"]:
@@ -96,7 +96,7 @@ def solve_upper(
 ) -> Float[Array, "d e n"]:
     """L⁻ᵀ B of the lower triangular L, by backward substitution."""
     # Mirrored, the upper triangle is a lower one.
-    return solve_lower(transposed(factor)[::-1, ::-1], right[::-1])[::-1]
+    return solve_lower(transpose(factor)[::-1, ::-1], right[::-1])[::-1]
 
 
 def without_correlations(
@@ -142,7 +142,7 @@ def log_multinormal(
     whitening = jax.scipy.linalg.solve_triangular(factor, identity, lower=True)
     log_volume = jnp.sum(jnp.log(jnp.diagonal(factor)))
     # Written out, it is one loop also where many observations are compared with many states.
-    whitened = transformed(whitening, coordinates(residuals), is_lower=True)
+    whitened = transform(whitening, coordinates(residuals), is_lower=True)
     return total([log_normal(column, 1.0) for column in whitened]) - log_volume
 
 
@@ -169,22 +169,22 @@ class Linear(NamedTuple):
 def predict(state: Gaussian, dynamics: Linear) -> Gaussian:
     """The law of F x + b + N(0, Q)."""
     matrix, offset, noise = stored(dynamics.matrix), dynamics.offset, dynamics.noise
-    covariance = sandwiched(matrix, state.covariance) + noise
-    return Gaussian(applied(matrix, state.mean) + offset, stored(covariance))
+    covariance = sandwich(matrix, state.covariance) + noise
+    return Gaussian(apply(matrix, state.mean) + offset, stored(covariance))
 
 
-def through(dynamics: Linear, seen: Linear) -> Linear:
+def through(dynamics: Linear, emission: Linear) -> Linear:
     """y of F x + b + N(0, Q) as an observation of x: H F x + H b + c + N(0, H Q Hᵀ + R)."""
     matrix, offset, noise = dynamics
     return Linear(
-        product(seen.matrix, matrix),
-        applied(seen.matrix, offset) + seen.offset,
-        sandwiched(seen.matrix, noise) + seen.noise,
+        product(emission.matrix, matrix),
+        apply(emission.matrix, offset) + emission.offset,
+        sandwich(emission.matrix, noise) + emission.noise,
     )
 
 
 def update(
-    state: Gaussian, observation: Float[Array, "p #n"], seen: Linear
+    state: Gaussian, observation: Float[Array, "p #n"], emission: Linear
 ) -> tuple[Gaussian, Float[Array, " n"]]:
     """The law of x given y = H x + c + N(0, R), and log p(y), of each particle.
 
@@ -193,19 +193,19 @@ def update(
     is in Joseph's form, (I - K h) P (I - K h)ᵀ + r K Kᵀ, where rounding of the gain K counts in the
     second order only; for one entry it takes O(d²). An entry of y that is NaN is missing.
     """
-    observation, seen, present = without_missing(observation, seen)
-    law, log_density = update_by_all(state, observation, seen)
+    observation, emission, present = without_missing(observation, emission)
+    law, log_density = update_by_all(state, observation, emission)
     missing = jnp.sum((~present).astype(log_density.dtype), axis=0)
     return law, log_density + 0.5 * math.log(2 * math.pi) * missing
 
 
 def update_by_all(
-    state: Gaussian, observation: Float[Array, "p #n"], seen: Linear
+    state: Gaussian, observation: Float[Array, "p #n"], emission: Linear
 ) -> tuple[Gaussian, Float[Array, " n"]]:
-    """The same where no entry of y is missing: what all particles share stays shared."""
-    factor, variances = without_correlations(seen.noise)
-    rows = solve_lower(factor, seen.matrix)
-    targets = stored(solve_lower(factor, (observation - seen.offset)[:, None])[:, 0])
+    """`update` for a y without missing entries: what all particles share stays shared."""
+    factor, variances = without_correlations(emission.noise)
+    rows = solve_lower(factor, emission.matrix)
+    targets = stored(solve_lower(factor, (observation - emission.offset)[:, None])[:, 0])
     log_density = jnp.asarray(-0.5 * math.log(2 * math.pi) * len(rows), rows.dtype)
     for row, target, variance in zip(rows, targets, variances, strict=True):
         state, log_factor = _update_by_one(state, row, target, variance)
@@ -216,22 +216,22 @@ def update_by_all(
 def _update_by_one(
     state: Gaussian, row: Float[Array, "d #n"], target: Float[Array, " #n"], variance: Array
 ) -> tuple[Gaussian, Float[Array, " n"]]:
-    """The same for one number, h x + N(0, r), and log p(y) but for the factor 2 pi."""
+    """The law of x given one number, y = h x + N(0, r), and log p(y) without the factor 2 pi."""
     mean, covariance = state
-    seen = stored(applied(covariance, row))
-    known = applied(row[None], seen)[0]
+    cross = stored(apply(covariance, row))
+    signal = apply(row[None], cross)[0]
     # Rounding may leave a zero variance slightly negative.
-    spread = jnp.maximum(known, 0.0) + variance
+    spread = jnp.maximum(signal, 0.0) + variance
     has_spread = spread > 0
     spread = jnp.where(has_spread, spread, jnp.finfo(mean.dtype).tiny)
     precision, log_spread = _once(1 / spread), _once(jnp.log(spread))
-    missed = target - applied(row[None], mean)[0]
-    gain = stored(jnp.where(has_spread, precision, 0.0)[None] * seen)
-    left = covariance - gain[:, None] * seen[None]
-    both = left - applied(left, row)[:, None] * gain[None]
+    innovation = target - apply(row[None], mean)[0]
+    gain = stored(jnp.where(has_spread, precision, 0.0)[None] * cross)
+    left = covariance - gain[:, None] * cross[None]
+    both = left - apply(left, row)[:, None] * gain[None]
     both = both + variance[None, None] * gain[:, None] * gain[None]
-    log_density = -0.5 * (precision * missed**2 + log_spread)
-    return Gaussian(mean + gain * missed[None], symmetric(both)), log_density
+    log_density = -0.5 * (precision * innovation**2 + log_spread)
+    return Gaussian(mean + gain * innovation[None], symmetric(both)), log_density
 
 
 def _once(values: Float[Array, "*rest n"]) -> Float[Array, "*rest n"]:
@@ -240,16 +240,16 @@ def _once(values: Float[Array, "*rest n"]) -> Float[Array, "*rest n"]:
 
 
 def without_missing(
-    observation: Float[Array, "p #n"], seen: Linear
+    observation: Float[Array, "p #n"], emission: Linear
 ) -> tuple[Float[Array, "p #n"], Linear, Bool[Array, "p #n"]]:
-    """The same without the entries that are NaN: in their place stands a zero of variance 1."""
+    """The observation with 0, and its model with variance 1, for each entry that is NaN."""
     present = ~jnp.isnan(observation)
-    here = present.astype(seen.matrix.dtype)
+    here = present.astype(emission.matrix.dtype)
     both = present[:, None] & present[None]
     alone = jnp.eye(len(here), dtype=here.dtype)[:, :, None]
     clear = Linear(
-        jnp.where(present[:, None], seen.matrix, 0.0),
-        jnp.where(present, seen.offset, 0.0),
-        jnp.where(both, seen.noise, alone * (1 - here[None])),
+        jnp.where(present[:, None], emission.matrix, 0.0),
+        jnp.where(present, emission.offset, 0.0),
+        jnp.where(both, emission.noise, alone * (1 - here[None])),
     )
     return jnp.where(present, observation, 0.0), clear, present

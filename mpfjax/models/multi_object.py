@@ -22,7 +22,7 @@ from mpfjax.models.base import (
     check_moved,
     is_made_of_noise,
     real_each,
-    replaced,
+    replace_fields,
     with_inputs,
 )
 from mpfjax.models.law import refuse_marginalised
@@ -94,7 +94,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
             axes = (eqx.if_array(0) if per_object else None, None if self.shared_inputs else 0)
             give = eqx.filter_vmap(with_inputs, in_axes=axes, axis_size=self.num_objects)
             model, per_object = give(model, inputs), True
-        return replaced(self, object_model=model, per_object=per_object)
+        return replace_fields(self, object_model=model, per_object=per_object)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """x_0 of every object, independent: every leaf (n, J, ...)."""
@@ -195,8 +195,8 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
         """The particles in which one object has these states."""
         num_particles = jax.tree.leaves(particles)[0].shape[0]
         objects = jnp.broadcast_to(objects, (num_particles,))
-        chosen = objects[:, None] == self._indices[None]
-        return select_rows(chosen, jax.tree.map(lambda leaf: leaf[:, None], states), particles)
+        is_object = objects[:, None] == self._indices[None]
+        return select_rows(is_object, jax.tree.map(lambda leaf: leaf[:, None], states), particles)
 
     def sample_object_transition(
         self, key: Key[Array, ""], states: PyTree, objects: Int[Array, "*n"]
@@ -238,7 +238,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
         self, states: PyTree, previous_states: PyTree, objects: Int[Array, "*n"]
     ) -> Float[Array, " n"]:
         """log D(x_t^j | x_{t-1}^j) of one object of each particle."""
-        return self._asked("log_transition", objects, states, previous_states)
+        return self._ask("log_transition", objects, states, previous_states)
 
     def object_with_history(
         self, states: PyTree, previous_states: PyTree, objects: Int[Array, "*n"]
@@ -246,9 +246,9 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
         """The states of one object of each particle, with the past of these previous states."""
         if not hasattr(self.object_model, "with_history"):
             return states
-        return self._asked("with_history", objects, states, previous_states)
+        return self._ask("with_history", objects, states, previous_states)
 
-    def _asked(self, method: str, objects: Int[Array, "*n"], *states: PyTree) -> PyTree:
+    def _ask(self, method: str, objects: Int[Array, "*n"], *states: PyTree) -> PyTree:
         """What a method of the objects' models says of one object of each particle."""
 
         def ask(j: Int[Array, "*n"], *states: PyTree) -> PyTree:

@@ -12,8 +12,8 @@ from mpfjax.operations.random import (
     bits,
     normal,
     normal_quantile,
+    scramble,
     scrambled_directions,
-    shuffled,
     sobol_points,
     split,
     uniform,
@@ -59,7 +59,7 @@ def draw_noise(
     n, d = shape
     key_first, key_second = split(key, 2)
     if kind == "stratified":
-        ranks = _shuffled_ranks(key_second, jnp.arange(n, dtype=jnp.int32)).astype(jnp.uint32)
+        ranks = _scramble_ranks(key_second, jnp.arange(n, dtype=jnp.int32)).astype(jnp.uint32)
         points = ranks[:, None] * _multipliers(d)[None] + bits(key_first, (d,))[None]
         return normal_of(points, dtype)
     ranks = jnp.arange(n, dtype=jnp.int32)
@@ -72,7 +72,7 @@ def draw_noise(
         of_slots = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
         shifts = stored(of_slots) << _UNUSED
     if shuffle:
-        ranks = _shuffled_ranks(jax.random.fold_in(key_second, 1), ranks)
+        ranks = _scramble_ranks(jax.random.fold_in(key_second, 1), ranks)
     if d == 1:
         points = (ranks.astype(jnp.uint32) * _multipliers(1))[None] + shifts
     else:
@@ -82,8 +82,8 @@ def draw_noise(
     return stored(normal_of(points, dtype)).T
 
 
-def _shuffled_ranks(key: Key[Array, ""], ranks: Int[Array, " n"]) -> Int[Array, " n"]:
-    dealt = shuffled(ranks, bits(key, ()), _num_digits(ranks.shape[0]))
+def _scramble_ranks(key: Key[Array, ""], ranks: Int[Array, " n"]) -> Int[Array, " n"]:
+    dealt = scramble(ranks, bits(key, ()), _num_digits(ranks.shape[0]))
     return stored(dealt.astype(jnp.int32))
 
 

@@ -54,14 +54,14 @@ def as_series(data: PyTree, model: Any) -> Series:
 
     In the result `present` is known, and None if no observation is missing.
     """
-    series = gathered(data)
+    series = series_of(data)
     observations = as_arrays(series.observations)
     length = _length(observations, series.observations, "observations")
-    present = present_steps(observations, series, refused_by(model))
+    present = present_steps(observations, series, refusal_of(model))
     return Series(observations, steps_of_inputs(series.inputs, length, model), present=present)
 
 
-def gathered(data: PyTree, inputs: PyTree = None, missing: str = "error") -> Series:
+def series_of(data: PyTree, inputs: PyTree = None, missing: str = "error") -> Series:
     """The data as a `Series`, unchecked; `inputs` and `missing` are those of `run_filter`."""
     check(Literal["error", "skip"], missing=missing)
     if not isinstance(data, Series):
@@ -73,7 +73,7 @@ def gathered(data: PyTree, inputs: PyTree = None, missing: str = "error") -> Ser
 
 def check_series(data: PyTree) -> None:
     """A `ValueError` for observations that no model can be run on."""
-    observations = gathered(data).observations
+    observations = series_of(data).observations
     _length(as_arrays(observations), observations, "observations")
 
 
@@ -93,7 +93,7 @@ def steps_of_inputs(
         isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arrays)
     ):
         inspect(arrays)
-    return refused_where(~usable, arrays, f"inputs: {NOT_FINITE}")
+    return refuse_where(~usable, arrays, f"inputs: {NOT_FINITE}")
 
 
 def one_input(inputs: PyTree, model: Any) -> PyTree:
@@ -101,7 +101,7 @@ def one_input(inputs: PyTree, model: Any) -> PyTree:
     arrays = _inputs(inputs, model, in_time=False)
     if arrays is None:
         return None
-    return refused_where(~_is_usable(arrays, NOT_FINITE), arrays, f"inputs: {NOT_FINITE}")
+    return refuse_where(~_is_usable(arrays, NOT_FINITE), arrays, f"inputs: {NOT_FINITE}")
 
 
 def _inputs(inputs: PyTree, model: Any, in_time: bool) -> PyTree:
@@ -126,9 +126,9 @@ def one_observation(observation: PyTree, model: Any = None) -> PyTree:
     Under the caller's own jit, numbers are all NaN where the model refuses one of them.
     """
     arrays = as_arrays(observation, "observation", in_time=False)
-    refused = "" if model is None else refused_by(model)
+    refused = "" if model is None else refusal_of(model)
     broken = ~_is_usable(arrays, refused)
-    return refused_where(broken, arrays, f"observation: {refused}", "; use predict to skip it")
+    return refuse_where(broken, arrays, f"observation: {refused}", "; use predict to skip it")
 
 
 def _is_usable(arrays: PyTree, refused: str) -> Any:
@@ -137,25 +137,25 @@ def _is_usable(arrays: PyTree, refused: str) -> Any:
     return _steps_where(one_step, "all", _USABLE[refused])[0]
 
 
-def present_steps(observations: PyTree, series: Series, refused: str) -> Any:
+def present_steps(observations: PyTree, series: Series, fault: str) -> Any:
     """Which observations are there, (t,), or None where all are; raises for data not to be run.
 
     A warning says how many steps are skipped of which some numbers are there.
     """
-    usable, present = _steps_where(observations, "all", _USABLE[refused]), series.present
+    usable, present = _steps_where(observations, "all", _USABLE[fault]), series.present
     numpy = numpy_for(usable, present)
     if present is not None:
         check_shape(f"{len(usable)}", present=present)
     present = numpy.ones(usable.shape, bool) if present is None else numpy.asarray(present, bool)
     if series.skips_missing:
-        seen = usable
-        if refused != NOT_FINITE:
-            seen = _steps_where(observations, "any", lambda numpy, leaf: ~numpy.isnan(leaf))
+        is_observed = usable
+        if fault != NOT_FINITE:
+            is_observed = _steps_where(observations, "any", lambda numpy, leaf: ~numpy.isnan(leaf))
         elif numpy is np:
             _warn_of_parts(observations, present & ~usable)
-        present = present & seen
-    hint = "; Series.skipping(observations) takes them as missing" * (refused == NOT_FINITE)
-    present = refused_where(present & ~usable, present, f"observations: {refused}", hint)
+        present = present & is_observed
+    hint = "; Series.skipping(observations) takes them as missing" * (fault == NOT_FINITE)
+    present = refuse_where(present & ~usable, present, f"observations: {fault}", hint)
     return None if numpy is np and present.all() else jnp.asarray(present)
 
 
@@ -183,8 +183,8 @@ def _warn_of_parts(observations: PyTree, skipped: Bool[np.ndarray, " t"]) -> Non
         some = _steps_where(inexact, "any", lambda numpy, leaf: numpy.isfinite(leaf))
         if (skipped & some).any():
             number = f"{(skipped & some).sum()} of {len(skipped)} steps"
-            said = f"{number} are skipped for a NaN or infinity beside finite numbers"
-            warn(f"observations: {said}; a model with handles_missing = True is given them")
+            message = f"{number} are skipped for a NaN or infinity beside finite numbers"
+            warn(f"observations: {message}; a model with handles_missing = True is given them")
 
 
 # What of an observation or of inputs is refused; "" is nothing.
@@ -196,7 +196,7 @@ _USABLE: dict[str, Callable[[Any, Any], Any]] = {
 }
 
 
-def refused_by(model: Any) -> str:
+def refusal_of(model: Any) -> str:
     """What of an observation the model is not given: a Kalman filter takes NaN, but no infinity."""
     if not getattr(model, "handles_missing", False):
         return NOT_FINITE
@@ -221,20 +221,20 @@ def _steps_where(arrays: PyTree, combine: str, holds: Callable[[Any, Any], Any])
     return getattr(numpy.stack(rows), combine)(axis=0)
 
 
-def refused_where(broken: Any, tree: PyTree, fault: str, hint: str = "") -> PyTree:
+def refuse_where(broken: Any, tree: PyTree, fault: str, hint: str = "") -> PyTree:
     """The tree; a `ValueError` where it is broken, that names the first of several steps.
 
-    A program cannot raise. So within a caller's jit it goes on with NaN, see `spoiled`.
+    A program cannot raise. So within a caller's jit it goes on with NaN, see `spoil`.
     """
     if isinstance(broken, Tracer):
-        return spoiled(tree, broken)
+        return spoil(tree, broken)
     if broken.any():
         at = f" at index {int(np.argmax(broken))} of the leading axis" if broken.ndim else ""
         raise ValueError(f"{fault}{at}{hint}")
     return tree
 
 
-def spoiled(tree: PyTree, broken: Bool[Array, "..."]) -> PyTree:
+def spoil(tree: PyTree, broken: Bool[Array, "..."]) -> PyTree:
     """The tree, with NaN for all its floating point numbers if anything is broken.
 
     NaN goes through to all results that depend on them, so that whoever called the program can see

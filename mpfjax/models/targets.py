@@ -12,7 +12,7 @@ from mpfjax.arrays import (
     to_array,
 )
 from mpfjax.checks import SHARES, is_series
-from mpfjax.models.base import AbstractStateSpaceModel, mapped, replaced, with_inputs
+from mpfjax.models.base import AbstractStateSpaceModel, over_particles, replace_fields, with_inputs
 from mpfjax.models.births import AbstractBirth
 from mpfjax.models.clutter import PASSED_ON, ClutteredModel, number_or_function
 from mpfjax.operations.logarithms import default_float
@@ -60,7 +60,9 @@ class TargetsModel(AbstractStateSpaceModel, Fitting):
 
     def with_inputs(self, inputs: PyTree) -> "TargetsModel":
         """The model whose objects have u_t."""
-        return replaced(self, sensors=tuple(with_inputs(each, inputs) for each in self.sensors))
+        return replace_fields(
+            self, sensors=tuple(with_inputs(each, inputs) for each in self.sensors)
+        )
 
     def scans(self, observation: PyTree) -> tuple[PyTree, ...]:
         """The measurements of each sensor; a `ValueError` for another number of these."""
@@ -87,7 +89,7 @@ class TargetsModel(AbstractStateSpaceModel, Fitting):
     def survival(self, states: PyTree) -> Float[Array, " #n"]:
         """p_S of each state."""
         p = self.survival_probability
-        p = mapped(self.sensors[0].object_model, p)(states) if callable(p) else p[None]
+        p = over_particles(self.sensors[0].object_model, p)(states) if callable(p) else p[None]
         return p.astype(default_float())
 
     def __getattr__(self, name: str) -> Any:

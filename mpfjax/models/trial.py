@@ -177,14 +177,14 @@ def _with_first_missing(observation: PyTree) -> PyTree:
 def _warn_of_derivative(model: Any, observation: PyTree, states: PyTree, where: str = "") -> None:
     """A warning if log L has a derivative of NaN by the numbers of the model."""
     try:
-        slopes = with_floats_traced(lambda own: _derivative(own, observation, states), model)
+        slopes = with_floats_traced(lambda traced: _derivative(traced, observation, states), model)
     except (TypeError, ValueError, NotImplementedError):
         # JAX has no derivative of it, as of a while loop in reverse (ValueError), of whole numbers
         # (TypeError) or of a call to the host (NotImplementedError). A filter needs none.
         return
     if any(np.isnan(slope).any() for slope in jax.tree.leaves(slopes)):
-        said = f"{model_name(model)}.log_likelihood has a derivative of NaN{where}"
-        warn(f"model: {said}", UserWarning)
+        message = f"{model_name(model)}.log_likelihood has a derivative of NaN{where}"
+        warn(f"model: {message}", UserWarning)
 
 
 @eqx.filter_jit

@@ -129,19 +129,19 @@ class AbstractMove(Given):
         """The moves that it runs."""
         moves: Moves = ()
         for name in self.holds:
-            held = getattr(self, name)
-            moves += held if isinstance(held, tuple) else (held,)
+            part = getattr(self, name)
+            moves += part if isinstance(part, tuple) else (part,)
         return moves
 
     def map_inner(self, change: Callable[[Any], Any]) -> Any:
         """The move with `change(move)` in the place of each move that it runs."""
         if not self.holds:
             return self
-        changed = {}
+        parts = {}
         for name in self.holds:
-            held = getattr(self, name)
-            changed[name] = tuple(map(change, held)) if isinstance(held, tuple) else change(held)
-        return dataclasses.replace(self, **changed)
+            part = getattr(self, name)
+            parts[name] = tuple(map(change, part)) if isinstance(part, tuple) else change(part)
+        return dataclasses.replace(self, **parts)
 
 
 Moves = tuple[AbstractMove, ...]
@@ -197,10 +197,10 @@ def memory_of(moves: Iterable[AbstractMove], now: Step, num_components: int) -> 
     """The initial memory of all moves; a `ValueError` where two have one of the same name."""
     memory: dict[str, PyTree] = {}
     for move in moves:
-        own = move.initial_memory(now, num_components)
-        for name in sorted(own.keys() & memory.keys()):
+        entries = move.initial_memory(now, num_components)
+        for name in sorted(entries.keys() & memory.keys()):
             raise ValueError(f"moves: two of them keep the memory {name!r}, as {name_of(move)}")
-        memory |= own
+        memory |= entries
     return memory
 
 
@@ -235,9 +235,9 @@ class AbstractRegrouping(AbstractMove):
         if mixture.num_components == 1 or is_missing(now):
             return mixture
         # Indicators are whole numbers and have no derivative.
-        return self.regrouped(mixture, *self.regroup(key, jax.lax.stop_gradient(mixture)))
+        return self.with_indicators(mixture, *self.regroup(key, jax.lax.stop_gradient(mixture)))
 
-    def regrouped(
+    def with_indicators(
         self, mixture: ParticleMixture, indicators: Int[Array, " n"], memory: dict[str, PyTree]
     ) -> ParticleMixture:
         """The mixture with these indicators, broken if a particle's is outside of [0, M)."""
@@ -355,7 +355,7 @@ class AbstractWrapper(AbstractMove):
         return memory_of(self.inner, now, num_components)
 
     def around(self, reference: Any) -> Any:
-        """The same with the moves around the trajectory."""
+        """The move, with the moves that it runs around the trajectory."""
         return self.map_inner(lambda move: move.around(reference))
 
 
@@ -385,7 +385,7 @@ def propagation_of(moves: Moves) -> AbstractPropagationOfEach | None:
     for move in moves:
         if isinstance(move, AbstractPropagationOfEach):
             return move
-        held = None if isinstance(move, AbstractPropagation) else propagation_of(move.inner)
-        if held is not None:
-            return held
+        inner = None if isinstance(move, AbstractPropagation) else propagation_of(move.inner)
+        if inner is not None:
+            return inner
     return None

@@ -29,7 +29,7 @@ class ReferenceSlot(Memory):
 
     slot: Int[Array, ""]
 
-    def kept_slot(self) -> Int[Array, ""]:
+    def reference_slot(self) -> Int[Array, ""]:
         """The slot of x*_t, which always has an offspring."""
         return self.slot
 
@@ -37,8 +37,8 @@ class ReferenceSlot(Memory):
         self, before: ParticleMixture, after: ParticleMixture, offspring: Offspring
     ) -> "ReferenceSlot":
         """The slot of its offspring."""
-        assert offspring.kept is not None
-        return ReferenceSlot(offspring.kept)
+        assert offspring.reference is not None
+        return ReferenceSlot(offspring.reference)
 
 
 class Reference(NamedTuple):
@@ -80,7 +80,7 @@ class ConditionalPropagation(AbstractPropagation):
         if proposal is None or is_missing(now):
             unseen = dataclasses.replace(now, observation=None)
             moved = self._with_reference(self.move(key, mixture, unseen))
-            return moved if is_missing(now) else self.move.weighed(moved, now)
+            return moved if is_missing(now) else self.move.reweight(moved, now)
         states, log_density = proposal.propose(key, now, previous)
         moved = self._with_reference(mixture.replace(particles=states))
         slot = mixture.memory[REFERENCE].slot
@@ -90,13 +90,15 @@ class ConditionalPropagation(AbstractPropagation):
 
         log_own = proposal.log_density(now, of_slot(moved.particles), of_slot(previous))
         log_density = put(log_density, log_own[0], slot)
-        return self.move.weighed(moved, now, previous, log_density)
+        return self.move.reweight(moved, now, previous, log_density)
 
     def _with_reference(self, mixture: ParticleMixture) -> ParticleMixture:
         """The particles of x_t, with x*_t in its slot."""
         slot = mixture.memory[REFERENCE].slot
         states = jax.tree.map(lambda leaf: at(leaf, mixture.t), self.reference.trajectory)
-        particles = jax.tree.map(lambda leaf, own: put(leaf, own, slot), mixture.particles, states)
+        particles = jax.tree.map(
+            lambda leaf, state: put(leaf, state, slot), mixture.particles, states
+        )
         return mixture.replace(particles=particles)
 
 

@@ -45,7 +45,7 @@ class EveIndices(Memory):
 
     @classmethod
     def of(cls, mixture: ParticleMixture) -> "EveIndices":
-        """Those of x_0, every particle its own Eve."""
+        """The Eve indices of x_0, where every particle is its own Eve."""
         n, m = mixture.num_particles, mixture.num_components
         return cls(
             indices=jnp.arange(n, dtype=jnp.int32),
@@ -139,6 +139,6 @@ def _by_components(eve: EveIndices, mixture: ParticleMixture) -> Float[Array, "m
 
     mass = of_different(jnp.ones_like(factors))
     # Where hardly a pair is left, rounding is all that there is.
-    found = mass > 1e-4 * jnp.sum(totals, axis=1)[:, None] * jnp.sum(totals, axis=1)[None]
-    averages = jnp.where(found, of_different(factors) / jnp.where(found, mass, 1.0), 1.0)
+    has_pairs = mass > 1e-4 * jnp.sum(totals, axis=1)[:, None] * jnp.sum(totals, axis=1)[None]
+    averages = jnp.where(has_pairs, of_different(factors) / jnp.where(has_pairs, mass, 1.0), 1.0)
     return jnp.log(jnp.clip(averages, jnp.min(factors), 1.0)) + largest

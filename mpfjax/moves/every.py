@@ -52,8 +52,8 @@ class Every(AbstractWrapper):
 
     def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
         """The number of steps since the moves last ran, and the moves' own memory."""
-        own = {self.name: {"steps": jnp.zeros((), jnp.int32)}}
-        return own | super().initial_memory(now, num_components)
+        counter = {self.name: {"steps": jnp.zeros((), jnp.int32)}}
+        return counter | super().initial_memory(now, num_components)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
@@ -62,9 +62,9 @@ class Every(AbstractWrapper):
         if is_missing(now):
             return mixture
         steps = mixture.memory[self.name]["steps"] + 1
-        counted = mixture.memory | {self.name: {"steps": steps % self.every}}
+        memory = mixture.memory | {self.name: {"steps": steps % self.every}}
         # As after the moves, which run at every k-th step alone: both have one form.
-        mixture = mixture.replace(memory=counted).with_order(False)
+        mixture = mixture.replace(memory=memory).with_order(False)
         runs = steps == self.every
 
         def run() -> ParticleMixture:

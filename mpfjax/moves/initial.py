@@ -34,8 +34,8 @@ class SelectInitial(AbstractMove):
 
     K N draws of x_0 take the place of the mixture's N. From each, x_1 is drawn twice. ν is the mean
     of the two likelihoods of y_1, shrunk towards the mean over all draws: the less the two
-    likelihoods of a draw agree, the less they tell of x_0 (`trusted`). N draws are kept with
-    probabilities in proportion to ν, and weigh 1 / ν, so that they represent x_0 as all draws do.
+    likelihoods of a draw agree, the less they tell of x_0 (`selection_weights`). N draws are kept
+    with probabilities in proportion to ν, and weigh 1 / ν, so that they represent x_0 as all do.
     Their mass is part of the first increment, and Ẑ stays unbiased. A wide prior is covered as by
     K N particles, at the cost of 2 K more draws of x_1 in the whole run.
 
@@ -50,7 +50,7 @@ class SelectInitial(AbstractMove):
 
     Put it first among `initial_moves`, before those that regroup. Raises `ValueError` for K < 1
     and unknown noise, and in a filter without `Propagate` or `PropagateNested`. Use it where the
-    prior is somewhat wide beside the likelihood; where it is very wide, `with_start`.
+    prior is somewhat wide beside the likelihood; where it is very wide, `with_initialisation`.
     """
 
     num_draws: Count = eqx.field(static=True, default=4)
@@ -70,7 +70,7 @@ class SelectInitial(AbstractMove):
         """The mixture of the chosen x_0, in one component; without y_1 the one given."""
         if now.observation is None:
             return mixture
-        start = self._selected(key, now, mixture.num_particles)
+        start = self._select(key, now, mixture.num_particles)
         return start.replace(num_components=mixture.num_components, memory=mixture.memory)
 
     def num_fitting(self, log_weights: Float[np.ndarray, " n"]) -> float:
@@ -83,30 +83,30 @@ class SelectInitial(AbstractMove):
 
     def is_wide(self, log_weights: Float[np.ndarray, " n"]) -> bool:
         """Whether so few draws fit y_1 that chance decides the masses of modes."""
-        number, drawn = self.num_fitting(log_weights), self.num_draws * len(log_weights)
-        return bool(number < min(FEWEST, LEAST_PART * drawn))
+        number, total = self.num_fitting(log_weights), self.num_draws * len(log_weights)
+        return bool(number < min(FEWEST, LEAST_PART * total))
 
-    def _selected(self, key: Key[Array, ""], now: Step, n: int) -> ParticleMixture:
+    def _select(self, key: Key[Array, ""], now: Step, n: int) -> ParticleMixture:
         """N of K N draws; a few draws a particle at a time, so that memory has room for them."""
         key_drawn, key_look, key_kept = split(key, 3)
         at_once = next(k for k in range(MOST_AT_ONCE, 0, -1) if self.num_draws % k == 0)
 
         def look(keys: Key[Array, "2"]) -> tuple[PyTree, Float[Array, "k 2"], Float[Array, ""]]:
-            drawn = now.initial_law.sample_initial(keys[0], at_once * n, self.noise)
-            log_factors, log_scale = two_looks(keys[1], now, drawn)
-            return drawn, log_factors.T, log_scale
+            states = now.initial_law.sample_initial(keys[0], at_once * n, self.noise)
+            log_factors, log_scale = two_looks(keys[1], now, states)
+            return states, log_factors.T, log_scale
 
         def flat(leaf: Array) -> Array:
             return leaf.reshape(-1, *leaf.shape[2:])
 
         if (num_rounds := self.num_draws // at_once) == 1:
-            drawn, log_factors, _ = look(jnp.stack([key_drawn, key_look]))
+            states, log_factors, _ = look(jnp.stack([key_drawn, key_look]))
         else:
             rounds = [jax.random.split(each, num_rounds) for each in (key_drawn, key_look)]
-            drawn, log_factors, log_scales = jax.lax.map(look, jnp.stack(rounds, axis=1))
+            states, log_factors, log_scales = jax.lax.map(look, jnp.stack(rounds, axis=1))
             log_factors += (log_scales - jnp.max(log_scales))[:, None, None]
-            drawn, log_factors = jax.tree.map(flat, (drawn, log_factors))
-        return chosen(key_kept, drawn, log_factors.T, n, self.noise == "rqmc")
+            states, log_factors = jax.tree.map(flat, (states, log_factors))
+        return select(key_kept, states, log_factors.T, n, self.noise == "rqmc")
 
 
 def require_propagation(now: Step, what: str) -> None:
@@ -124,14 +124,14 @@ def two_looks(
     """The log-weights of two draws of x_t of each x_{t-1}, and their common scale."""
     assert now.propagation is not None
     # Stored, so that x_t is drawn on vectors, and once, not wherever its likelihood is used.
-    twice = single_component(states).repeated(2).map_slots(stored)
+    twice = single_component(states).repeat(2).map_slots(stored)
     twice = now.propagation(key, twice, now)
     return stored(twice.log_weights).reshape(-1, 2).T, twice.log_scale
 
 
-def chosen(
+def select(
     key: Key[Array, ""],
-    drawn: PyTree,
+    states: PyTree,
     log_factors: Float[Array, "2 k"],
     number: int,
     in_order: bool,
@@ -140,24 +140,28 @@ def chosen(
 
     The logarithm of their mass, of which 1 is the mean, is the mixture's `log_scale`.
     """
-    trust = stored(jax.lax.stop_gradient(trusted(log_factors, jnp.ones_like(log_factors[0]))))
-    pool = single_component(drawn)
+    trust = stored(
+        jax.lax.stop_gradient(selection_weights(log_factors, jnp.ones_like(log_factors[0])))
+    )
+    pool = single_component(states)
     order = sorted_order(pool, pool.component_indicators, HILBERT) if in_order else None
     weights = whole(trust if order is None else take(trust, order), 0.0)
     totals = jnp.sum(weights, keepdims=True)
     line = Line(pool.num_particles, weights, totals, jnp.zeros_like(totals), weights > 0, order)
     targets = jnp.full(1, number, jnp.int32)
-    kept = draw_ancestors(key, line, targets, "systematic", num_slots=number).particles
+    indices = draw_ancestors(key, line, targets, "systematic", num_slots=number).particles
     # No ν is below a quarter, so that their inverses need no logarithms to be summed.
-    trust = take(trust, kept).astype(default_float())
+    trust = take(trust, indices).astype(default_float())
     total = jnp.sum(1 / trust)
-    particles = jax.tree.map(lambda leaf: take(leaf, kept), drawn)
+    particles = jax.tree.map(lambda leaf: take(leaf, indices), states)
     return single_component(particles).replace(
         log_weights=-jnp.log(trust * total), log_scale=jnp.log(total / number)
     )
 
 
-def trusted(log_factors: Float[Array, "2 n"], weights: Float[Array, " n"]) -> Float[Array, " n"]:
+def selection_weights(
+    log_factors: Float[Array, "2 n"], weights: Float[Array, " n"]
+) -> Float[Array, " n"]:
     """ν of each particle, with a weighted mean of 1, from two draws of its likelihood.
 
     Let r be the correlation of the two draws. The mean of both tells E[L | x] with the reliability

@@ -141,5 +141,5 @@ def _as_rows(states: PyTree) -> tuple[Float[Array, "n d"], Callable[[Array], PyT
 
 def _gaps(key: Key[Array, ""], model: Any, parents: PyTree) -> Float[Array, "n d"]:
     """The difference of two draws of x_t from each parent, as rows."""
-    first, second = (_as_rows(model.sample_transition(own, parents))[0] for own in split(key, 2))
+    first, second = (_as_rows(model.sample_transition(each, parents))[0] for each in split(key, 2))
     return without_gradient(first - second)

@@ -119,7 +119,7 @@ def is_traced(tree: PyTree) -> bool:
 def jit_with_floats_traced(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """`jit_on_wide_vectors` of a function of filters or models, by `with_floats_traced`."""
     compiled = jit_on_wide_vectors(function)
-    return lambda *arguments: with_floats_traced(lambda own: compiled(*own), arguments)
+    return lambda *arguments: with_floats_traced(lambda traced: compiled(*traced), arguments)
 
 
 # The errors of JAX where Python asks for the value of a traced number.

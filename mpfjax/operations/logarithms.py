@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Inexact, PyTree, Shaped
 
 
 def as_inexact(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:
-    """The same numbers in floating point, in which whole numbers and booleans can be averaged."""
+    """The numbers in floating point, in which whole numbers and booleans can be averaged."""
     is_inexact = jnp.issubdtype(values.dtype, jnp.inexact)
     return values if is_inexact else values.astype(default_float())
 
@@ -42,7 +42,7 @@ def _add_gradient_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def without_gradient(tree: PyTree) -> PyTree:
-    """The same values, all of them constants to a derivative."""
+    """The tree's values as constants to a derivative."""
     return jax.tree.map(
         lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree
     )

@@ -51,12 +51,12 @@ def draw_columns(
     target = uniform * upto[:, -1]
     block = _first_above(target, upto, sums)
     rows = jnp.arange(num_rows, dtype=jnp.int32)
-    chosen = blocks[rows, block]
+    picks = blocks[rows, block]
     if within is None:
         rest = target - (upto[rows, block] - sums[rows, block])
     else:
         rest = within * sums[rows, block]
-    column = _first_above(rest, jnp.cumsum(chosen, axis=1), chosen)
+    column = _first_above(rest, jnp.cumsum(picks, axis=1), picks)
     return jnp.minimum(block * size + column, num_columns - 1)
 
 
@@ -112,11 +112,11 @@ def solve_lower(
     It is written out for the same reason as `cholesky`. LAPACK's own has also been seen to hang
     when a program solves several large batches at once.
     """
-    solved = jnp.zeros_like(vectors)
+    solution = jnp.zeros_like(vectors)
     for i in range(vectors.shape[1]):
-        rest = vectors[:, i] - jnp.sum(factors[:, i] * solved, axis=1)
-        solved = solved.at[:, i].set(rest / factors[:, i, i])
-    return solved
+        rest = vectors[:, i] - jnp.sum(factors[:, i] * solution, axis=1)
+        solution = solution.at[:, i].set(rest / factors[:, i, i])
+    return solution
 
 
 def coordinates(points: Float[Array, "n d"]) -> Coordinates:
@@ -124,7 +124,7 @@ def coordinates(points: Float[Array, "n d"]) -> Coordinates:
     return [points[:, i] for i in range(points.shape[1])]
 
 
-def transformed(
+def transform(
     matrix: Float[Array, "e d"], points: Coordinates, is_lower: bool = False
 ) -> Coordinates:
     """A x of each point x; `is_lower` says that A has zeros above its diagonal."""

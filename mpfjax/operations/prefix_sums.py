@@ -41,10 +41,10 @@ def sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Ar
     zero a share of the line. On a CPU, blocks are multiplied by a triangle of ones, which is
     several times faster than XLA's own cumulative sum. Other platforms use XLA's.
     """
-    return on_platform(values, cpu=_blocked_sum_before, default=_scanned_sum_before)
+    return on_platform(values, cpu=_blocked_sum_before, default=_sum_before_by_scan)
 
 
-def _scanned_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+def _sum_before_by_scan(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     upto = jnp.cumsum(values)
     total = upto[-1]
     # Each zero takes the sum of the next value that is not zero.
@@ -119,7 +119,7 @@ class Positions(NamedTuple):
     whole: Int[Array, "*shape"]
     fraction: Float[Array, "*shape"]
 
-    def moved_by(self, distance: Float[Array, "..."]) -> "Positions":
+    def shift(self, distance: Float[Array, "..."]) -> "Positions":
         """The positions so many slots and parts of one further on."""
         turns = jnp.floor(distance)
         fraction = self.fraction + (distance - turns)

@@ -47,7 +47,7 @@ _DIGITS = 32
 
 
 def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
-    """The same key, from which `jax.random` draws the same numbers in less time on a CPU.
+    """The key in a form from which `jax.random` draws its numbers in less time on a CPU.
 
     For a CPU, XLA compiles JAX's Threefry as a loop over its rounds. It cannot fuse a loop with
     what uses the bits. Here the 20 rounds of Threefry-2x32 (Salmon et al. 2011, "Parallel random
@@ -299,7 +299,7 @@ def sobol_points(
     return points
 
 
-def shuffled(
+def scramble(
     indices: Int[Array, " n"], seed: UInt32[Array, ""], num_digits: int
 ) -> UInt32[Array, " n"]:
     """The indices below 2^num_digits under a random permutation of these, another for each seed.

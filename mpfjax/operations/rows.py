@@ -13,10 +13,10 @@ def along_rows(values: Shaped[Array, "*n"], rows: Shaped[Array, "..."]) -> Shape
     return jnp.expand_dims(values, tuple(range(values.ndim, rows.ndim)))
 
 
-def select_rows(chosen: Bool[Array, "*n"], new: PyTree, old: PyTree) -> PyTree:
+def select_rows(is_new: Bool[Array, "*n"], new: PyTree, old: PyTree) -> PyTree:
     """The `new` rows of every leaf where they are chosen, and the `old` ones elsewhere."""
 
     def select(new: Array, old: Array) -> Array:
-        return jnp.where(along_rows(chosen, new), new, old)
+        return jnp.where(along_rows(is_new, new), new, old)
 
     return jax.tree.map(select, new, old)

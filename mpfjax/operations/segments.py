@@ -107,7 +107,7 @@ def segment_any(
 ) -> Bool[Array, " num_segments"]:
     """Which segments have a masked entry; labels are in [0, num_segments)."""
     if num_segments > _MOST_WORDS * _WORD:
-        return _scattered("max", mask.astype(jnp.int32), segments, num_segments, 0) > 0
+        return _scatter("max", mask.astype(jnp.int32), segments, num_segments, 0) > 0
     word_of, bit = segments >> _WORD_BITS, (segments & (_WORD - 1)).astype(jnp.uint32)
     bits = jnp.uint32(1) << bit
     words = []
@@ -134,7 +134,7 @@ def segment_reduce(
     if not are_masked(len(values), num_segments):
         if how == "add":
             return _scattered_sum(values, segments, num_segments)
-        return _scattered(how, values, segments, num_segments, nothing)
+        return _scatter(how, values, segments, num_segments, nothing)
     # XLA fuses the masks into the sum and never stores them.
     is_member = segments[None] == jnp.arange(num_segments, dtype=segments.dtype)[:, None]
     of_each = jnp.where(is_member, values[None], nothing)
@@ -147,7 +147,7 @@ def segment_counts(
 ) -> Int[Array, " num_segments"]:
     """How many of the masked entries lie in each segment."""
     if mask.shape[0] >= EXACT_IN_FLOAT32:
-        return _scattered("add", mask.astype(jnp.int32), segments, num_segments, 0)
+        return _scatter("add", mask.astype(jnp.int32), segments, num_segments, 0)
     return segment_sum(mask.astype(default_float()), segments, num_segments).astype(jnp.int32)
 
 
@@ -155,7 +155,7 @@ def segment_counts(
 def _scattered_sum(
     values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " num_segments"]:
-    return _scattered("add", stored(values), segments, num_segments, 0)
+    return _scatter("add", stored(values), segments, num_segments, 0)
 
 
 @_scattered_sum.defjvp
@@ -166,7 +166,7 @@ def _scattered_sum_jvp(num_segments: int, primals: tuple, tangents: tuple) -> tu
     return _scattered_sum(values, segments, num_segments), tangent
 
 
-def _scattered(
+def _scatter(
     how: str,
     values: Shaped[Array, " n"],
     segments: Int[Array, " n"],

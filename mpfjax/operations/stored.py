@@ -62,7 +62,7 @@ def whole(values: Shaped[Array, " n"], fill: float) -> Shaped[Array, " p"]:
 
 @jax.custom_jvp
 def stored(values: Shaped[Array, "*rest n"]) -> Shaped[Array, "*rest n"]:
-    """The same numbers, computed once and kept, where XLA on a CPU would not keep them.
+    """The values, computed once and stored, where XLA on a CPU would not store them.
 
     XLA would compute them again wherever they are used: once for every particle, even if there is
     one for each component, and without vectors in a scatter or gather over flattened rows.

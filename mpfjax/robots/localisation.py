@@ -25,7 +25,7 @@ from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.gaussians import log_normal
 from mpfjax.operations.random import normal, split, uniform
 from mpfjax.robots.maps import OccupancyGrid, Poses
-from mpfjax.robots.motion import wrapped
+from mpfjax.robots.motion import wrap
 from mpfjax.robots.sensors import POSE
 
 _MOTION = Rule(
@@ -132,7 +132,7 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
         """log p(x_0), by square metre and radian."""
         if self.initial_pose is not None:
             x, y, turn = (states - self.initial_pose[None]).T
-            steps = jnp.stack([x, y, wrapped(turn)], axis=1)
+            steps = jnp.stack([x, y, wrap(turn)], axis=1)
             return jnp.sum(log_normal(steps, self.initial_deviations[None]), axis=1)
         is_start = self.grid.free & (self.grid.distances > self.clearance)
         density = 1 / (2 * np.pi * len(self.starts) * self.grid.resolution**2)
@@ -140,7 +140,7 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
 
     @property
     def noise_dimension(self) -> int:
-        """That of the motion."""
+        """The number of coordinates of the motion's noise."""
         return self.motion.noise_dimension
 
     def transition_from_noise(self, noise: Float[Array, "n k"], states: Poses) -> Poses:

@@ -22,7 +22,7 @@ from mpfjax.checks import (
     warn,
 )
 from mpfjax.extras import optional
-from mpfjax.models.base import replaced
+from mpfjax.models.base import replace_fields
 
 Poses = Float[Array, "n 3"]
 Angles = Float[Array, " b"]
@@ -77,9 +77,9 @@ class OccupancyGrid(Fitting):
             jnp.floor((places[..., k] - self.origin[k]) / self.resolution).astype(jnp.int32)
             for k in (0, 1)
         )
-        return self._clipped(rows, columns)
+        return self._clip(rows, columns)
 
-    def _clipped(self, rows: Array, columns: Array) -> tuple[Array, Array, Array]:
+    def _clip(self, rows: Array, columns: Array) -> tuple[Array, Array, Array]:
         height, width = self.occupied.shape
         inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
         return jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1), inside
@@ -100,7 +100,7 @@ class OccupancyGrid(Fitting):
         looked up.
         """
         if self.table is not None:
-            return self._looked_up(poses, angles, max_range)
+            return self._look_up(poses, angles, max_range)
         # The loop has no derivative in reverse, and a range none that is of use.
         poses, limit = jax.lax.stop_gradient(poses), max_range / self.resolution
         safe = jnp.where(self.occupied, -1.0, self.distances / self.resolution)
@@ -124,7 +124,7 @@ class OccupancyGrid(Fitting):
 
         def advance(carry: tuple[Array, ...]) -> tuple[Array, ...]:
             reach, x, y, going = carry
-            rows, columns, inside = self._clipped(y.astype(jnp.int32), x.astype(jnp.int32))
+            rows, columns, inside = self._clip(y.astype(jnp.int32), x.astype(jnp.int32))
             gaps = jnp.where(inside, safe[rows, columns], jnp.inf)
             of_x, of_y = border(axes[0], x), border(axes[1], y)
             nearest = jnp.maximum(jnp.minimum(of_x, of_y), reach)
@@ -159,9 +159,9 @@ class OccupancyGrid(Fitting):
         poses = jnp.asarray(np.stack([x, y, 0 * x], axis=-1), float)
         farthest = self.resolution * sum(self.occupied.shape)
         ranges = jax.lax.map(lambda row: self.ranges(row, angles, farthest), poses)
-        return replaced(self, table=jnp.where(ranges < farthest, ranges, jnp.inf))
+        return replace_fields(self, table=jnp.where(ranges < farthest, ranges, jnp.inf))
 
-    def _looked_up(self, poses: Poses, angles: Angles, max_range: float) -> Beams:
+    def _look_up(self, poses: Poses, angles: Angles, max_range: float) -> Beams:
         table: Any = self.table
         rows, columns, _ = self.cells(poses[:, None, :2])
         turn = 2 * np.pi / table.shape[2]

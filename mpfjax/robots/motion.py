@@ -49,7 +49,7 @@ class OdometryMotion(Fitting):
         forward, left, turn = odometry
         way = jnp.where(forward < 0, -1, 1).astype(forward.dtype)
         trans, rot1 = way * jnp.hypot(forward, left), jnp.arctan2(way * left, way * forward)
-        rot2 = wrapped(turn - rot1)
+        rot2 = wrap(turn - rot1)
         one = jnp.where(jnp.abs(trans) < _IN_PLACE, 0.0, rot1) ** 2
         other, drive = jnp.where(jnp.abs(trans) < _IN_PLACE, turn, rot2) ** 2, trans**2
         variances = [
@@ -61,7 +61,7 @@ class OdometryMotion(Fitting):
         first, far, second = (jnp.stack([rot1, trans, rot2])[None] + deviations[None] * noise).T
         x, y, heading = poses.T
         x, y = x + far * jnp.cos(heading + first), y + far * jnp.sin(heading + first)
-        return jnp.stack([x, y, wrapped(heading + first + second)], axis=1)
+        return jnp.stack([x, y, wrap(heading + first + second)], axis=1)
 
 
 @overload
@@ -114,7 +114,7 @@ def odometry_steps(
 def _steps(poses: np.ndarray) -> np.ndarray:
     x, y, turn = np.diff(poses, axis=0).T
     cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-    return np.stack([cos * x + sin * y, cos * y - sin * x, wrapped(turn)], axis=1)
+    return np.stack([cos * x + sin * y, cos * y - sin * x, wrap(turn)], axis=1)
 
 
 @checked
@@ -133,9 +133,9 @@ def interpolated_poses(times: Any, pose_times: Any, poses: Any) -> Float[np.ndar
         raise ValueError(f"times: not all within {knots[0]:.15g}..{knots[-1]:.15g} of pose_times")
     columns = (*rows[:, :2].T, np.unwrap(rows[:, 2]))
     x, y, turn = (np.interp(at, knots, column) for column in columns)
-    return np.stack([x, y, wrapped(turn)], axis=1)
+    return np.stack([x, y, wrap(turn)], axis=1)
 
 
-def wrapped(angles: Any) -> Any:
+def wrap(angles: Any) -> Any:
     """In [-π, π)."""
     return (angles + np.pi) % (2 * np.pi) - np.pi

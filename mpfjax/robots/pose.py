@@ -12,7 +12,7 @@ from mpfjax.checks import InnerShare, Positive, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.random import split
-from mpfjax.robots.motion import wrapped
+from mpfjax.robots.motion import wrap
 
 _MOST_ODDS = 10.0  # in logarithms: twice the alarm's, so that doubt ends as soon as it may
 _LEAST_WEIGHT = 1e-3  # of a hypothesis that is reported
@@ -104,7 +104,7 @@ def _summary(mixture: ParticleMixture, radius: Array) -> tuple[Array, ...]:
     sums = [jnp.sum(mass * each) for each in (x, y, jnp.cos(heading), jnp.sin(heading))]
     pose = jnp.stack([sums[0] / share, sums[1] / share, jnp.arctan2(sums[3], sums[2])])
     away = mixture.particles - pose[None]
-    away = away.at[:, 2].set(wrapped(away[:, 2]))
+    away = away.at[:, 2].set(wrap(away[:, 2]))
     covariance = (mass[:, None] * away).T @ away / share
     means = mixture.component_means()
     far = jnp.hypot(*(means[:, :2] - pose[None, :2]).T) >= radius
@@ -134,10 +134,10 @@ def follow(
     Raises `ValueError` at the first scan for a filter without an alarm. Use it in a robot: the
     program is compiled in the first steps, and all later ones take the same time, but for restarts.
     """
-    return _followed(key, filter, scans, radius, probability)
+    return _follow(key, filter, scans, radius, probability)
 
 
-def _followed(
+def _follow(
     key: Any, filter: Filter, scans: Iterable[tuple[Any, Any]], radius: float, probability: float
 ) -> Iterator[PoseEstimate]:
     mixture, log_odds = None, np.log(probability)

@@ -92,7 +92,7 @@ class AbstractLaser(Fitting):
         check_shape(str(len(self.angles)), observation=scan)
         met = (scan > self.laser_min_range) & (scan < self.laser_max_range)
         usable = self.usable(scan, met)
-        angles, scan, met, is_used = self._spaced(usable, self.angles, scan, met)
+        angles, scan, met, is_used = self._space_out(usable, self.angles, scan, met)
         forward, left, turn = self.mount
         cos, sin = jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2])
         steps = [cos * forward - sin * left, sin * forward + cos * left, jnp.full_like(cos, turn)]
@@ -114,16 +114,16 @@ class AbstractLaser(Fitting):
             * total
         )
 
-    def _spaced(self, usable: Bool[Array, " k"], *values: Array) -> list[Array]:
+    def _space_out(self, usable: Bool[Array, " k"], *values: Array) -> list[Array]:
         """The values of at most `max_beams` usable beams, evenly spaced, and which are any."""
         most = min(self.max_beams, len(self.angles))
         if most == len(self.angles):
             return [*values, usable]
         upto, rank = jnp.cumsum(usable, dtype=jnp.int32), jnp.arange(most, dtype=jnp.int32)
         gap = (upto[-1].astype(float) - 1) / max(most - 1, 1)
-        spaced = jnp.round(rank.astype(float) * gap).astype(jnp.int32)
-        wanted = jnp.where(upto[-1] > most, spaced, rank)
-        at = jnp.clip(jnp.searchsorted(upto, wanted + 1), 0, len(self.angles) - 1)
+        even_ranks = jnp.round(rank.astype(float) * gap).astype(jnp.int32)
+        ranks = jnp.where(upto[-1] > most, even_ranks, rank)
+        at = jnp.clip(jnp.searchsorted(upto, ranks + 1), 0, len(self.angles) - 1)
         return [*(value[at] for value in values), rank < upto[-1]]
 
     @abc.abstractmethod

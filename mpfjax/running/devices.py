@@ -69,18 +69,18 @@ def over_devices(
     chosen = [] if traced and devices is None else choose(devices)
     if len(chosen) < 2:
         if not traced and chosen != jax.devices()[:1]:
-            inputs, arguments = _placed((inputs, arguments), chosen[0])
+            inputs, arguments = _place((inputs, arguments), chosen[0])
         return run_on_one(inputs, *arguments)
     num_inputs = length_of(inputs)
     padding = -num_inputs % len(chosen)
     padded = _at(inputs, np.arange(num_inputs + padding)) if padding else inputs
     mesh = Mesh(np.array(chosen), (DEVICE_AXIS,))
     if not traced:
-        padded = _placed(padded, NamedSharding(mesh, P(DEVICE_AXIS)))
-        arguments = _placed(arguments, NamedSharding(mesh, P()))
+        padded = _place(padded, NamedSharding(mesh, P(DEVICE_AXIS)))
+        arguments = _place(arguments, NamedSharding(mesh, P()))
     result = _spread(run, padded, arguments, mesh)
     if not traced:
-        result = _gathered(result, mesh)
+        result = _gather(result, mesh)
     if padding:
         result = jax.tree.map(lambda leaf: leaf[:num_inputs], result)
     return result
@@ -108,7 +108,7 @@ def _spread(run, inputs, arguments, mesh):
     return jax.shard_map(on_each, mesh=mesh, **specs, check_vma=False)(inputs, arrays)
 
 
-def _placed(tree: PyTree, where: Any) -> PyTree:
+def _place(tree: PyTree, where: Any) -> PyTree:
     """Every array of the tree moved to a device or sharding."""
     arrays, rest = eqx.partition(tree, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
     if jax.process_count() == 1:
@@ -119,9 +119,9 @@ def _placed(tree: PyTree, where: Any) -> PyTree:
 
 def _require_same_everywhere(arrays: PyTree) -> None:
     """Raise if the processes do not hold the same numbers; they exchange a digest only."""
-    held = [leaf for leaf in jax.tree.leaves(arrays) if not _is_global(leaf)]
-    own = np.frombuffer(bytes.fromhex(fingerprint(held)), np.uint8)
-    if (multihost_utils.process_allgather(own) != own[None]).any():
+    leaves = [leaf for leaf in jax.tree.leaves(arrays) if not _is_global(leaf)]
+    digest = np.frombuffer(bytes.fromhex(fingerprint(leaves)), np.uint8)
+    if (multihost_utils.process_allgather(digest) != digest[None]).any():
         raise ValueError("keys, filter, observations: not the same in every process")
 
 
@@ -140,7 +140,7 @@ def _is_global(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array) and not leaf.is_fully_addressable
 
 
-def _gathered(tree: PyTree, mesh: Mesh) -> PyTree:
+def _gather(tree: PyTree, mesh: Mesh) -> PyTree:
     if jax.process_count() == 1:
         return jax.device_put(tree, mesh.devices.flat[0])
     everywhere = jax.jit(lambda tree: tree, out_shardings=NamedSharding(mesh, P()))(tree)
@@ -166,7 +166,7 @@ def over_threads(
     def run_block(first: int) -> PyTree:
         return jax.block_until_ready(program(run, np.asarray(first), size, inputs, arguments))
 
-    are_alike = _threads().submit(_seen_by_thread).result() == _seen_by_thread()
+    are_alike = _threads().submit(_thread_state).result() == _thread_state()
     blocks = (_threads().map if are_alike else map)(run_block, starts)
     return _end_to_end(list(blocks), num_inputs)
 
@@ -191,7 +191,7 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(2, num_processors()), thread_name_prefix="mpfjax")
 
 
-def _seen_by_thread() -> tuple[Any, ...]:
+def _thread_state() -> tuple[Any, ...]:
     """JAX's settings and the active transformations; where JAX does not tell, the thread itself."""
     name = "get_opaque_trace_state"  # before JAX 0.7 in jax.core
     trace_state = getattr(jax.extend.core, name, None) or getattr(jax.core, name, None)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Key, PyTree
 from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.observations import as_series, gathered
+from mpfjax.models.observations import as_series, series_of
 from mpfjax.moves.base import AbstractMove, Step, is_missing
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.islands import (
@@ -61,8 +61,8 @@ def run_islands(
     - `devices`: a number or a sequence of `jax.devices()`, whose number must divide G. None takes
       the largest number of devices that divides G.
     - `collect(mixture)` sees one island, whose weights sum to its mass. Its results are stacked
-      over t and islands, (t, G, ...). The sum over islands of `average`, `mean` or `variance` is
-      that of the whole mixture.
+      over t and islands, (t, G, ...). The sum over islands of `expectation`, `mean` or `variance`
+      is that of the whole mixture.
 
     The result is that of `run_filter` on the whole mixture. Slots and component labels of island g
     come after those of island g - 1, ancestors may be on other islands, and only `memory` keeps a
@@ -71,14 +71,14 @@ def run_islands(
     divide G. Use it if one filter is too large or too slow for one device. For many runs of a
     filter that fits on one device, use `monte_carlo`.
     """
-    series = as_series(gathered(observations, inputs, missing), filter.model)
+    series = as_series(series_of(observations, inputs, missing), filter.model)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
 
     def run(filter: Filter) -> FilterRun:
         arguments, dividing = (filter, series, collect), partial(_dividing, num_islands)
         return over_devices(_run_block, _run_on_one, keys, arguments, devices, dividing)
 
-    return sound(_joined(with_floats_traced(run, filter), collect is None))
+    return sound(_join(with_floats_traced(run, filter), collect is None))
 
 
 def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any]:
@@ -104,7 +104,7 @@ def _run_on_one(keys, filter, series, collect):
     return jax.tree.map(lambda leaf: leaf[0], run)
 
 
-def _joined(run: FilterRun, whole: bool) -> FilterRun:
+def _join(run: FilterRun, whole: bool) -> FilterRun:
     """The run of the whole mixture, from one whose every leaf has a leading axis of islands."""
     if whole:
         collected = jax.vmap(_whole_mixture, in_axes=1)(run.collected)

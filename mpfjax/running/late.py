@@ -60,7 +60,7 @@ class Replay(Checked):
     ) -> tuple[History, StepInfo]:
         """The history after y_t, None if it is missing or has not arrived yet, and the report."""
         past = PastStep(key, history.mixture, observation, inputs)
-        mixture, info = self._taken(past)
+        mixture, info = self._take(past)
         return History(mixture, (*history.steps, past)[-self.lag :]), info
 
     @checked
@@ -81,11 +81,11 @@ class Replay(Checked):
         mixture = steps[place].mixture
         for t in range(place, len(steps)):
             steps[t] = steps[t]._replace(mixture=mixture)
-            mixture, info = self._taken(steps[t])
+            mixture, info = self._take(steps[t])
             infos.append(info)
         return History(mixture, tuple(steps)), infos
 
-    def _taken(self, past: PastStep) -> tuple[ParticleMixture, StepInfo]:
+    def _take(self, past: PastStep) -> tuple[ParticleMixture, StepInfo]:
         """The step itself."""
         key, mixture, observation, inputs = past
         if observation is None:

@@ -14,11 +14,11 @@ from tqdm import tqdm
 from mpfjax.checks import Checked, Count, warn
 from mpfjax.running.storage import (
     arrays_of,
-    described,
+    describe_parts,
     differences,
-    filled,
     program_of,
     read_described,
+    tree_of_arrays,
     write_described,
 )
 
@@ -80,12 +80,12 @@ class LongRun:
         of one. Ctrl-C, and what is `Broken`, end it with a warning and the steps before; without
         any row, Ctrl-C is raised, and what is broken at the start is a RuntimeError.
         """
-        return self.go_on(self._loaded(like) or start(), advance)
+        return self.go_on(self._load(like) or start(), advance)
 
     def go_on(self, state: State, advance: Advance) -> tuple[State, str | None]:
-        """The same from a state on."""
+        """Advance from a state to the last step."""
         every = self.last if self.checkpoint is None else self.checkpoint.every
-        pieces, saved, stopped = [state.rows], state.step, None
+        pieces, last_save, stopped = [state.rows], state.step, None
         bar = tqdm(total=self.last, initial=state.step, disable=not self.progress, unit="step")
         try:
             while state.step < self.last:
@@ -94,7 +94,7 @@ class LongRun:
                 bar.update(step - state.step)
                 state, pieces = State(step, carry, None), [*pieces, rows]
                 if step % every == 0:
-                    pieces, saved = [self._saved(state, pieces)], step
+                    pieces, last_save = [self._save(state, pieces)], step
         except Broken as error:
             if not state.step:
                 raise RuntimeError(f"{self.caller}: {error} at the start") from error
@@ -105,34 +105,34 @@ class LongRun:
             stopped = f"interrupted at step {state.step} of {self.last}"
         finally:
             bar.close()
-            if state.step > saved:
-                pieces = [self._saved(state, pieces)]
+            if state.step > last_save:
+                pieces = [self._save(state, pieces)]
         if stopped is not None:
             warn(f"{self.caller}: {stopped}; its result is of the steps before", UserWarning)
-        return state._replace(rows=_joined(pieces)), stopped
+        return state._replace(rows=_concatenate(pieces)), stopped
 
-    def _saved(self, state: State, pieces: list[PyTree]) -> PyTree:
+    def _save(self, state: State, pieces: list[PyTree]) -> PyTree:
         """All rows in one piece, written to the file with the state."""
-        rows = _joined(pieces)
+        rows = _concatenate(pieces)
         if self.checkpoint is not None:
             arrays = arrays_of({"carry": state.carry, "rows": rows})
             notes = {"step": state.step, "identity": self.identity(state.step)}
             write_described(self.checkpoint.path, arrays, notes)
         return rows
 
-    def _loaded(self, like: State) -> State | None:
+    def _load(self, like: State) -> State | None:
         """The state that the file holds, None without a file; a `ValueError` for another run's."""
         if self.checkpoint is None or not Path(self.checkpoint.path).exists():
             return None
         path = self.checkpoint.path
         arrays, notes = read_described(path)
-        step, found = notes.get("step", 0), notes.get("identity", {})
-        own = self.identity(step)
-        if found != own:
-            said = differences(found, own)
-            raise ValueError(f"checkpoint: {path} is of another {self.caller}: {said}")
-        held = filled(path, arrays, {"carry": like.carry, "rows": like.rows})
-        return State(step, held["carry"], held["rows"])
+        step, other = notes.get("step", 0), notes.get("identity", {})
+        identity = self.identity(step)
+        if other != identity:
+            difference = differences(other, identity)
+            raise ValueError(f"checkpoint: {path} is of another {self.caller}: {difference}")
+        state = tree_of_arrays(path, arrays, {"carry": like.carry, "rows": like.rows})
+        return State(step, state["carry"], state["rows"])
 
 
 def identity_of(
@@ -145,12 +145,12 @@ def identity_of(
     """
     if checkpoint is None:
         return {}
-    told = {"caller": caller} | described(**settings)
+    texts = {"caller": caller} | describe_parts(**settings)
     if checkpoint.name is not None:
-        return told | {"name": checkpoint.name}
+        return texts | {"name": checkpoint.name}
     programs = {part: program_of(*call) for part, call in functions.items() if call[0] is not None}
-    return told | programs
+    return texts | programs
 
 
-def _joined(pieces: list[PyTree]) -> PyTree:
+def _concatenate(pieces: list[PyTree]) -> PyTree:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)

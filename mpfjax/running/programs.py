@@ -10,7 +10,7 @@ from jax.experimental.compilation_cache import compilation_cache
 _settings: Any = jax.config  # whose attributes no type checker knows
 
 
-def keep_programs(folder: str | Path | None = None) -> Path:
+def enable_compilation_cache(folder: str | Path | None = None) -> Path:
     """Keep compiled programs in a folder: a later process that needs the same ones starts sooner.
 
     This switches on JAX's persistent compilation cache, for every program of the process, whatever
@@ -26,8 +26,8 @@ def keep_programs(folder: str | Path | None = None) -> Path:
     """
     if folder is None:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        own: str | None = _settings.jax_compilation_cache_dir
-        folder = own or caches / "mpfjax"
+        setting: str | None = _settings.jax_compilation_cache_dir
+        folder = setting or caches / "mpfjax"
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -11,10 +11,10 @@ from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.memory import at_start
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.observations import as_series, gathered
+from mpfjax.models.observations import as_series, series_of
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import num_processors, over_devices, over_threads
-from mpfjax.running.scan import FilterRun, first_mixture, initial_keys, scan, sound, told_of_start
+from mpfjax.running.scan import FilterRun, first_mixture, initial_keys, scan, sound, warn_of_start
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
 # have a row of particles each, which counts as so many times the particles.
@@ -53,9 +53,9 @@ def run_filter(
     a model that has no place for them. Raises `ValueError` during tracing for a model whose draws
     or densities have the wrong shape or type, and RuntimeError if its densities give NaN.
     """
-    series = as_series(gathered(observations, inputs, missing), filter.model)
-    run = with_floats_traced(lambda own: _run(key, own, series, collect), filter)
-    return told_of_start(sound(run), filter)
+    series = as_series(series_of(observations, inputs, missing), filter.model)
+    run = with_floats_traced(lambda traced: _run(key, traced, series, collect), filter)
+    return warn_of_start(sound(run), filter)
 
 
 @checked
@@ -68,7 +68,7 @@ def monte_carlo(
     inputs: PyTree = None,
     missing: Literal["error", "skip"] = "error",
     devices: int | Sequence[Any] | None = None,
-    slots: Count | None = None,
+    num_slots: Count | None = None,
 ) -> FilterRun:
     """Run a filter once for each key, all on the same observations, under `vmap`.
 
@@ -81,42 +81,42 @@ def monte_carlo(
       nothing. The result is gathered on the first one, and each process has all of it. Under the
       caller's own jit, grad or vmap, None is one device. On one CPU device, the runs are shared by
       a thread for each processor, if there is enough to do.
-    - `slots`: the length of the particle arrays, at least N; the slots after the first N stay
-      empty. None is N. Filters that differ in N alone compile once if they have the same `slots`:
-      1000, for example, for N = 50, 200 and 1000; the start alone compiles for each N. Each
-      then costs as much as 1000 particles. A run has the law of one without `slots`, though not the
-      same particles. `collect` sees the empty slots as well, with `occupied` false.
+    - `num_slots`: the length of the particle arrays, at least N; the slots after the first N stay
+      empty. None is N. Filters that differ in N alone compile once if they have the same
+      `num_slots`: 1000, for example, for N = 50, 200 and 1000; the start alone compiles for each N.
+      Each then costs as much as 1000 particles. A run has the law of one without `num_slots`,
+      though not the same particles. `collect` sees the empty slots as well, with `occupied` false.
 
-    Raises `ValueError` for more devices than there are, fewer slots than particles, and `slots`
+    Raises `ValueError` for more devices than there are, fewer slots than particles, and `num_slots`
     with the moves that need every slot, `PropagateIndependently` and `PropagateInClusters`.
     """
-    if slots is not None and slots < filter.num_particles:
-        raise ValueError(f"slots: {slots} is no whole number of at least N, {filter.num_particles}")
-    series = as_series(gathered(observations, inputs, missing), filter.model)
+    if num_slots is not None and num_slots < filter.num_particles:
+        raise ValueError(f"num_slots: {num_slots} is not at least N, {filter.num_particles}")
+    series = as_series(series_of(observations, inputs, missing), filter.model)
 
     def run(filter: Filter) -> FilterRun:
         starts = (keys, None)
-        if slots is not None:
+        if num_slots is not None:
             # A program of its own, since draws and moves of x_0 may depend on N.
-            starts = (keys, _start_each(keys, filter, series, int(slots)))
-            filter = filter.replace(num_particles=int(slots))
+            starts = (keys, _start_each(keys, filter, series, int(num_slots)))
+            filter = filter.replace(num_particles=int(num_slots))
         arguments = (filter, series, collect)
         return over_devices(_run_each, _run_on_threads, starts, arguments, devices)
 
-    return told_of_start(sound(with_floats_traced(run, filter)), filter)
+    return warn_of_start(sound(with_floats_traced(run, filter)), filter)
 
 
 _run = jit_on_wide_vectors(scan)
 
 
 @jit_on_wide_vectors
-def _start_each(keys, filter, series, slots):
+def _start_each(keys, filter, series, num_slots):
     """The mixture of x_0 of each run, in this number of slots."""
 
     def start(key: Key[Array, ""]) -> ParticleMixture:
         mixture = first_mixture(initial_keys(key, filter), filter, series)
         number = jnp.asarray(filter.num_particles, jnp.int32)
-        slot = jnp.arange(slots, dtype=jnp.int32)
+        slot = jnp.arange(num_slots, dtype=jnp.int32)
         # Those that stay empty hold one of the particles as well.
         filled = at_start(mixture.at(jnp.minimum(slot, number - 1)))
         return filled.replace(

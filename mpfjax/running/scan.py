@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import saying, warn
+from mpfjax.checks import Renamed, saying, warn
 from mpfjax.filter import Filter, with_densities
 from mpfjax.memory import check_run, warnings_of
 from mpfjax.mixture import ParticleMixture
@@ -39,7 +39,7 @@ class FilterRun(eqx.Module):
     - `effective_sample_size`: 1 / Σ W², of the joint weights W of all particles after each step.
     - `log_evidence_against_start`: that of each step's `StepInfo`, and None unless a move of the
       filter tells it.
-    - `surprised`: the steps at which all hypotheses seem wrong, since the cumulative sum of that
+    - `alarm`: the steps at which all hypotheses seem wrong, since the cumulative sum of that
       evidence is above 5. It never falls below zero nor rises above 10 (a CUSUM, Page 1954). None
       likewise.
     """
@@ -53,7 +53,8 @@ class FilterRun(eqx.Module):
     degenerate: Bool[Array, " t"]
     effective_sample_size: Float[Array, " t"]
     log_evidence_against_start: Float[Array, " t"] | None = None
-    surprised: Bool[Array, " t"] | None = None
+    alarm: Bool[Array, " t"] | None = None
+    surprised = Renamed("surprised", "alarm")
 
     @property
     def broken(self) -> Bool[Array, "..."]:
@@ -78,9 +79,9 @@ def scan(
         step_keys, now, t = step
         mixture, info = step_or_predict(filter, step_keys, mixture, now)
         with saying("collect", "called with the mixture after each step"):
-            given: tuple[Any, ...] = (mixture,) if t is None else (mixture, t, now.inputs)
-            kept = mixture if collect is None else collect(*given)
-        return mixture, (kept, report_of(info))
+            arguments: tuple[Any, ...] = (mixture,) if t is None else (mixture, t, now.inputs)
+            values = mixture if collect is None else collect(*arguments)
+        return mixture, (values, report_of(info))
 
     if initial is None:
         initial = first_mixture(keys_initial, filter, series)
@@ -135,7 +136,7 @@ _KEPT = (
     "degenerate",
     "effective_sample_size",
     "log_evidence_against_start",
-    "surprised",
+    "alarm",
 )
 # The effective number of fewer particles tells nothing.
 _NEARLY_ALL, _FEWEST_TOLD = 0.9, 8
@@ -146,8 +147,8 @@ Report = dict[str, PyTree]
 
 def report_of(info: StepInfo) -> Report:
     """The part of a step's report that a run keeps."""
-    kept = {name: getattr(info, name) for name in _KEPT}
-    return kept | {"log_likelihood_increments": info.log_likelihood_increment}
+    report = {name: getattr(info, name) for name in _KEPT}
+    return report | {"log_likelihood_increments": info.log_likelihood_increment}
 
 
 def run_of(
@@ -196,26 +197,26 @@ def sound(run: FilterRun, free: bool = True) -> FilterRun:
     is_blind = degenerate.any(axis=-1) & (degenerate | (np.asarray(increments) == 0)).all(axis=-1)
     if is_blind.any():
         which = _in_how_many(is_blind)
-        said = f"every step with an observation was degenerate{which}: no particle had any"
-        said += " likelihood; mpfjax.check_model tries a model out"
-        warn(said)
+        cause = f"every step with an observation was degenerate{which}: no particle had any"
+        cause += " likelihood; mpfjax.check_model tries a model out"
+        warn(cause)
     weighed = (np.asarray(increments) != 0) & ~degenerate
     num_weighed, is_alone = weighed.sum(axis=-1), np.asarray(run.effective_sample_size) < 2
     is_poor = (weighed & is_alone).sum(axis=-1) >= np.maximum(_NEARLY_ALL * num_weighed, 2)
     # Wrong units show in most runs; a few that lost the state tell nothing of the model.
     filled = run.initial.log_weights > -np.inf
     if free and is_poor.mean() > 0.5 and np.asarray(filled).sum(axis=-1).min() >= _FEWEST_TOLD:
-        said = "one particle had nearly all weight in nearly all steps with an observation"
-        said += f"{_in_how_many(is_poor)}: run.effective_sample_size is below 2. Are y and the"
-        warn(f"{said} model in the same units, and is its observation noise not too small?")
-    if run.surprised is not None and np.any(run.surprised[..., -1]):
-        surprised = np.asarray(run.surprised)
-        is_lost = surprised[..., -1]
+        cause = "one particle had nearly all weight in nearly all steps with an observation"
+        cause += f"{_in_how_many(is_poor)}: run.effective_sample_size is below 2. Are y and the"
+        warn(f"{cause} model in the same units, and is its observation noise not too small?")
+    if run.alarm is not None and np.any(run.alarm[..., -1]):
+        alarm = np.asarray(run.alarm)
+        is_lost = alarm[..., -1]
         which = _in_how_many(is_lost)
-        first = int(np.argmax(surprised.reshape(-1, surprised.shape[-1]).any(axis=0)))
-        said = f"at the end, what was observed speaks against all hypotheses{which}, first at index"
-        said += f" {first} of the steps: run.surprised; mpfjax.with_restarts lets the state begin"
-        warn(f"{said} anew")
+        first = int(np.argmax(alarm.reshape(-1, alarm.shape[-1]).any(axis=0)))
+        cause = f"at the end, what was observed speaks against all hypotheses{which}, first at"
+        cause += f" index {first} of the steps: run.alarm; mpfjax.with_restarts lets the state"
+        warn(f"{cause} begin anew")
     return run
 
 
@@ -224,7 +225,7 @@ def _in_how_many(which: np.ndarray | np.bool_) -> str:
     return f" in {which.sum()} of {which.size} runs" if which.ndim else ""
 
 
-def told_of_start(run: FilterRun, filter: Filter) -> FilterRun:
+def warn_of_start(run: FilterRun, filter: Filter) -> FilterRun:
     """The run, after a RuntimeWarning where few draws of x_0 fit y_1, in most of the first runs."""
     weights = run.initial.log_weights
     chosen = [move for move in filter.initial_moves if isinstance(move, SelectInitial)]
@@ -232,8 +233,8 @@ def told_of_start(run: FilterRun, filter: Filter) -> FilterRun:
         return run
     looked_at = np.asarray(weights).reshape(-1, weights.shape[-1])[:_MOST_LOOKED_AT]
     if np.mean([chosen[0].is_wide(each) for each in looked_at]) > 0.5:
-        said = f"hardly any draw of x_0 fits the first observation, of {chosen[0].num_draws} for"
-        said += " each particle, so that chance decides which modes live and their masses."
-        said += " mpfjax.with_start begins with a sampler on the first observations; it needs the"
-        warn(f"{said} density of x_0, log_initial, in the model")
+        cause = f"hardly any draw of x_0 fits the first observation, of {chosen[0].num_draws} for"
+        cause += " each particle, so that chance decides which modes live and their masses."
+        cause += " mpfjax.with_initialisation begins with a sampler on the first observations; it"
+        warn(f"{cause} needs the density of x_0, log_initial, in the model")
     return run

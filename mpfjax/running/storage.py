@@ -56,10 +56,10 @@ def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
     file that is truncated, damaged, not a checkpoint, or inconsistent, and for the checkpoint of
     another state, naming the difference.
     """
-    (arrays, saved), own = read_described(path), describe(like)
-    if saved != own:
-        raise ValueError(f"like: {path} holds another state: {differences(saved, own)}")
-    return filled(path, arrays, like)
+    (arrays, saved), expected = read_described(path), describe(like)
+    if saved != expected:
+        raise ValueError(f"like: {path} holds another state: {differences(saved, expected)}")
+    return tree_of_arrays(path, arrays, like)
 
 
 def arrays_of(state: PyTree) -> dict[str, np.ndarray]:
@@ -72,7 +72,9 @@ def arrays_of(state: PyTree) -> dict[str, np.ndarray]:
     return arrays
 
 
-def filled(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], like: PyTree) -> PyTree:
+def tree_of_arrays(
+    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], like: PyTree
+) -> PyTree:
     """A pytree like this one with the `arrays_of` another, of these dtypes but of any shapes.
 
     Raises `ValueError` where they do not fit.
@@ -115,12 +117,12 @@ def describe(tree: PyTree, *, values: bool = False) -> dict[str, str]:
     """
     of_leaf = _value if values else kind
     return _static_fields(tree, ()) | {
-        jax.tree_util.keystr(place): of_leaf(leaf) if is_data(leaf) else named(leaf)
+        jax.tree_util.keystr(place): of_leaf(leaf) if is_data(leaf) else stable_name(leaf)
         for place, leaf in jax.tree_util.tree_leaves_with_path(tree)
     }
 
 
-def described(**parts: PyTree) -> dict[str, str]:
+def describe_parts(**parts: PyTree) -> dict[str, str]:
     """All leaves of some pytrees with their values, by part and place."""
     return {
         f"{part}{place}": text
@@ -143,7 +145,7 @@ def program_of(function: Callable[..., Any], *arguments: Any) -> str:
     It tells apart functions of other code, and those that hold other numbers.
     """
     program, *_ = eqx.filter_make_jaxpr(function)(*arguments)
-    return fingerprint((named(program.jaxpr), list(_constants(program))))[:12]
+    return fingerprint((stable_name(program.jaxpr), list(_constants(program))))[:12]
 
 
 def _constants(program: Any) -> Iterator[Any]:
@@ -158,16 +160,16 @@ def _constants(program: Any) -> Iterator[Any]:
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     """The first few differences between two descriptions, in words."""
-    found = [
+    parts = [
         f"{name} is {there.get(name, 'not')} there and {here.get(name, 'not')} here"
         for name in sorted(there.keys() | here.keys())
         if there.get(name) != here.get(name)
     ]
-    more = len(found) - _MOST_SHOWN
-    return "; ".join(found[:_MOST_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+    more = len(parts) - _MOST_SHOWN
+    return "; ".join(parts[:_MOST_SHOWN]) + (f"; and {more} more" if more > 0 else "")
 
 
-def named(value: Any) -> str:
+def stable_name(value: Any) -> str:
     """A name for a function, or for another thing without a value; the same in every process."""
     return value if isinstance(value, str) else re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
@@ -207,21 +209,21 @@ def _value(leaf: Any) -> str:
 
 def _static_fields(tree: PyTree, place: tuple[Any, ...]) -> dict[str, str]:
     """The class and static fields of every module in a pytree, by their places."""
-    found = {}
+    texts = {}
     if isinstance(tree, eqx.Module):
         start = jax.tree_util.keystr(place)
-        found[f"{start}.__class__"] = type(tree).__name__
+        texts[f"{start}.__class__"] = type(tree).__name__
         for field in dataclasses.fields(tree):
             if field.metadata.get("static", False):
-                found[f"{start}.{field.name}"] = named(getattr(tree, field.name, None))
+                texts[f"{start}.{field.name}"] = stable_name(getattr(tree, field.name, None))
 
     def is_inner(node: Any) -> bool:
         return node is not tree and isinstance(node, eqx.Module)
 
     for inner, node in jax.tree_util.tree_leaves_with_path(tree, is_leaf=is_inner):
         if is_inner(node):
-            found |= _static_fields(node, place + inner)
-    return found
+            texts |= _static_fields(node, place + inner)
+    return texts
 
 
 def write_described(
@@ -243,9 +245,9 @@ def read_described(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray],
     """The arrays and the description that `write_described` wrote; `ValueError` for other files."""
     with open(path, "rb") as file:
         try:
-            found = np.load(file, allow_pickle=False)
+            archive = np.load(file, allow_pickle=False)
             # What is no array comes as bytes, which have no view.
-            arrays = {name: found[name].view() for name in found.files}
+            arrays = {name: archive[name].view() for name in archive.files}
             return arrays, dict(json.loads(str(arrays.pop(_DESCRIPTION))))
         except Exception as error:  # a flipped bit may lead to any
             raise ValueError(

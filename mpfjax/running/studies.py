@@ -23,7 +23,13 @@ from mpfjax.models.observations import as_series, check_series
 from mpfjax.operations.logarithms import default_float
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun
-from mpfjax.running.storage import described, differences, named, read_described, write_described
+from mpfjax.running.storage import (
+    describe_parts,
+    differences,
+    read_described,
+    stable_name,
+    write_described,
+)
 
 Values = Sequence[Any] | np.ndarray | Array
 
@@ -82,7 +88,7 @@ def run_study(
     resume: bool = False,
     seeds_at_once: Count | None = None,
     cells_at_once: Count = 1,
-    slots: Count | None = None,
+    num_slots: Count | None = None,
 ) -> list[dict[str, Any]]:
     """Run every cell of a study; with `resume`, go on where it was interrupted or killed.
 
@@ -103,10 +109,10 @@ def run_study(
     - `seeds_at_once`: how many seeds share one `vmap`; None is all. Set it if memory is short.
     - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both. Several
       processes must work on the same cell, and so run one cell at a time.
-    - `slots`: the length of the particle arrays, as for `monte_carlo`, in all cells with at most
-      so many particles. A filter then compiles once for all these N. Use it for small filters,
-      where the study spends more time on compiling than on running. A filter that fills every
-      slot, such as `independent_particle_filters`, raises an error.
+    - `num_slots`: the length of the particle arrays, as for `monte_carlo`, in all cells with at
+      most so many particles. A filter then compiles once for all these N. Use it for small filters,
+      where the study spends more time on compiling than on running. A filter that fills every slot,
+      such as `independent_particle_filters`, raises an error.
 
     Raises `ValueError` before anything runs: for an argument of another kind, for a `directory`
     that holds cells, and with `resume` for one of another study, naming what differs, and for files
@@ -118,17 +124,17 @@ def run_study(
     directory = Path(directory)
     cells, identity = _cells(study), _identity(study)
     if _cell_files(directory) and not resume:
-        raise ValueError(f"directory: {directory} holds {_said(directory)}; say resume to go on")
-    results = _finished(directory, identity)
+        raise ValueError(f"directory: {directory} holds {_summary(directory)}; say resume to go on")
+    results = _read_cells(directory, identity)
     pending = [cell for cell in cells if cell.file not in results]
     if results and jax.process_index() == 0:
-        print(f"{directory}: {_said(directory)} taken over, {len(pending)} to run")
+        print(f"{directory}: {_summary(directory)} taken over, {len(pending)} to run")
     if jax.process_count() > 1:
         cells_at_once = 1
 
     def finish(cell: _Cell) -> None:
         try:
-            measured = _measure(study, cell, seeds_at_once, slots)
+            measured = _measure(study, cell, seeds_at_once, num_slots)
         except Exception as error:
             error.add_note(f"in the cell {cell.description}")
             raise
@@ -156,7 +162,7 @@ def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
     there is no such directory, and `ValueError` for files in it that are cut off, damaged or of
     different studies.
     """
-    return list(_finished(Path(directory).resolve(strict=True)).values())
+    return list(_read_cells(Path(directory).resolve(strict=True)).values())
 
 
 class _Cell(NamedTuple):
@@ -190,11 +196,11 @@ def _cells(study: Study) -> list[_Cell]:
 def _axes(study: Study) -> dict[str, list[Any]]:
     """The values along each axis of the grid, the filters' names first, as JSON can hold them."""
     axes = {"num_particles": study.num_particles, **study.settings}
-    others = {name: _listed(name, values) for name, values in axes.items()}
-    return {"filter": _listed("filters", list(study.filters))} | others
+    others = {name: _as_list(name, values) for name, values in axes.items()}
+    return {"filter": _as_list("filters", list(study.filters))} | others
 
 
-def _listed(name: str, values: Any) -> list[Any]:
+def _as_list(name: str, values: Any) -> list[Any]:
     """The values along one axis; a `ValueError` for what is no list of numbers and strings."""
     each = [] if isinstance(values, str) or not np.iterable(values) else values
     plain = [value.item() if getattr(value, "shape", None) == () else value for value in each]
@@ -208,26 +214,28 @@ def _identity(study: Study) -> dict[str, str]:
     """All that has to be the same for a cell to be of this study, as text."""
     package = importlib.import_module(__name__.partition(".")[0])
     versions = f"mpfjax {package.__version__}, jax {jax.__version__}, {default_float()}"
-    functions = {"measure": named(study.measure), "collect": named(study.collect)}
+    functions = {"measure": stable_name(study.measure), "collect": stable_name(study.collect)}
     axes = {name: str(values) for name, values in _axes(study).items()}
-    data = described(keys=study.keys, observations=study.observations)
+    data = describe_parts(keys=study.keys, observations=study.observations)
     return axes | data | functions | {"versions": versions}
 
 
 def _cell_files(directory: Path) -> list[Path]:
     """The files of finished cells, in the order of the cells."""
-    found = [(_CELL_FILE.fullmatch(path.name), path) for path in directory.glob("*.npz")]
-    return [path for _, path in sorted((int(name[1]), path) for name, path in found if name)]
+    matches = [(_CELL_FILE.fullmatch(path.name), path) for path in directory.glob("*.npz")]
+    return [path for _, path in sorted((int(name[1]), path) for name, path in matches if name)]
 
 
-def _said(directory: Path) -> str:
+def _summary(directory: Path) -> str:
     """How many cells the directory holds, and of which day."""
     times = [path.stat().st_mtime for path in _cell_files(directory)]
     days = sorted({str(datetime.date.fromtimestamp(time)) for time in (min(times), max(times))})
     return f"{len(times)} finished cells of {' to '.join(days)}"
 
 
-def _finished(directory: Path, identity: dict[str, str] | None = None) -> dict[str, dict[str, Any]]:
+def _read_cells(
+    directory: Path, identity: dict[str, str] | None = None
+) -> dict[str, dict[str, Any]]:
     """The finished cells by their files: described, and with what was measured.
 
     They are all of one study, that of the first where none is given.
@@ -237,36 +245,38 @@ def _finished(directory: Path, identity: dict[str, str] | None = None) -> dict[s
     for path in _cell_files(directory):
         try:
             arrays, description = read_described(path)
-            found = dict(description.pop(_STUDY, {}))
-            identity = identity or found
-            if found != identity:
-                raise ValueError(f"{path}: of another study ({differences(found, identity)})")
+            other = dict(description.pop(_STUDY, {}))
+            identity = identity or other
+            if other != identity:
+                raise ValueError(f"{path}: of another study ({differences(other, identity)})")
             results[path.name] = description | arrays
         except ValueError as error:
             faults.append(str(error))
     if faults:
-        said = "; ".join(faults[:_MOST_FAULTS])
-        raise ValueError(f"directory: {said}; delete such files, and only their cells run again")
+        reasons = "; ".join(faults[:_MOST_FAULTS])
+        raise ValueError(f"directory: {reasons}; delete such files, and only their cells run again")
     return results
 
 
 def _measure(
-    study: Study, cell: _Cell, seeds_at_once: int | None, slots: int | None
+    study: Study, cell: _Cell, seeds_at_once: int | None, num_slots: int | None
 ) -> dict[str, np.ndarray]:
     """All seeds of one cell, a bounded number of them at once."""
-    if slots is not None and cell.filter.num_particles > slots:
-        slots = None
+    if num_slots is not None and cell.filter.num_particles > num_slots:
+        num_slots = None
     num_seeds = study.keys.shape[0]
     size = num_seeds if seeds_at_once is None else min(seeds_at_once, num_seeds)
     parts = []
     for start in range(0, num_seeds, size):
         # The last batch is filled up, so that it does not compile again.
         batch = study.keys[np.clip(np.arange(start, start + size), 0, num_seeds - 1)]
-        run = monte_carlo(batch, cell.filter, study.observations, study.collect, slots=slots)
+        run = monte_carlo(
+            batch, cell.filter, study.observations, study.collect, num_slots=num_slots
+        )
         measured = {name: np.asarray(array) for name, array in study.measure(run).items()}
         for name, array in measured.items():
             if name in cell.description or name in _TAKEN or array.shape[:1] != (size,):
-                said = f"{name} of shape {array.shape}"
-                raise ValueError(f"measure: {said} is of a cell, or has no axis of {size} seeds")
+                what = f"{name} of shape {array.shape}"
+                raise ValueError(f"measure: {what} is of a cell, or has no axis of {size} seeds")
         parts.append(measured)
     return {name: np.concatenate([part[name] for part in parts])[:num_seeds] for name in parts[0]}

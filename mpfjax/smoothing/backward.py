@@ -60,8 +60,8 @@ def draw_ends(
     return indices, jax.tree.map(lambda leaf: take(leaf, indices), final.particles)
 
 
-def ended(rows: PyTree, row: PyTree) -> PyTree:
-    """The rows of the times before, and that of the end."""
+def append_last(rows: PyTree, row: PyTree) -> PyTree:
+    """The rows of the earlier times, followed by the row of the last time."""
     return jax.tree.map(lambda before, end: jnp.concatenate([before, end[None]]), rows, row)
 
 

@@ -12,7 +12,7 @@ from mpfjax.checks import checked, kinds
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.models.law import law_of, refuse_marginalised
-from mpfjax.models.observations import Series, as_arrays, as_series, refused_where
+from mpfjax.models.observations import Series, as_arrays, as_series, refuse_where
 from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.random import split, uniform
@@ -91,10 +91,10 @@ def conditional_filter(
     trajectory = _as_states(trajectory, filter.model, series.length + 1)
     # Checked before the run: backward sampling could not recover an impossible trajectory.
     possible = eqx.filter_jit(possible_times)(filter.model, trajectory, series.inputs)
-    trajectory = refused_where(~possible, trajectory, _IMPOSSIBLE)
-    found = _run(key, filter, series, trajectory, backward)
-    found = eqx.tree_at(lambda found: found.run, found, sound(found.run, free=False))
-    return refused_where(~found.possible, found, _IMPOSSIBLE)
+    trajectory = refuse_where(~possible, trajectory, _IMPOSSIBLE)
+    result = _run(key, filter, series, trajectory, backward)
+    result = eqx.tree_at(lambda result: result.run, result, sound(result.run, free=False))
+    return refuse_where(~result.possible, result, _IMPOSSIBLE)
 
 
 def renew(
@@ -112,9 +112,9 @@ def renew(
     n = filter.num_particles
     first_slot = jnp.clip(jnp.floor(uniform(key_slot, ()) * n).astype(jnp.int32), 0, n - 1)
     # x_0 of every particle, drawn separately: a model may draw many of them in strata.
-    own = jax.vmap(lambda key: law_of(filter.model).sample_initial(key, 1))(split(key_initial, n))
-    particles = jax.tree.map(lambda leaf: leaf[:, 0], own)
-    start = jax.tree.map(lambda leaf, own: put(leaf, own[0], first_slot), particles, trajectory)
+    draws = jax.vmap(lambda key: law_of(filter.model).sample_initial(key, 1))(split(key_initial, n))
+    particles = jax.tree.map(lambda leaf: leaf[:, 0], draws)
+    start = jax.tree.map(lambda leaf, draws: put(leaf, draws[0], first_slot), particles, trajectory)
     reference = Reference(trajectory, first_slot)
     around = filter.replace(
         moves=[move.around(reference) for move in filter.moves],
@@ -125,13 +125,13 @@ def renew(
     run = scan(key_run, around, series, None, initial=initial)
     slots = run.collected.memory[REFERENCE].slot
     log_weights = jax.vmap(at)(run.collected.log_weights, slots)
-    seen = (log_weights > -jnp.inf) & ~run.degenerate
-    drawn = draw_trajectory(key_back, filter.model, run, series.inputs, backward)
+    is_alive = (log_weights > -jnp.inf) & ~run.degenerate
+    new = draw_trajectory(key_back, filter.model, run, series.inputs, backward)
     return ConditionalRun(
-        trajectory=drawn,
+        trajectory=new,
         run=run,
         slots=jnp.concatenate([first_slot[None], slots]),
-        possible=possible_times(filter.model, trajectory, series.inputs).at[1:].min(seen),
+        possible=possible_times(filter.model, trajectory, series.inputs).at[1:].min(is_alive),
     )
 
 
@@ -148,11 +148,11 @@ def draw_trajectory(
     """One trajectory of a run, by backward sampling or the genealogy: leaves (t + 1, ...)."""
     mixtures = mixtures_of(run)
     if backward:
-        drawn, _ = draw_trajectories(key, model, mixtures, inputs, 1)
+        paths, _ = draw_trajectories(key, model, mixtures, inputs, 1)
     else:
         end = draw(key, (1,), mixtures.log_weights[-1])
-        drawn = paths_through(mixtures, ancestors_of(end, mixtures))
-    return jax.tree.map(lambda leaf: leaf[0], drawn)
+        paths = paths_through(mixtures, ancestors_of(end, mixtures))
+    return jax.tree.map(lambda leaf: leaf[0], paths)
 
 
 def possible_times(model: Any, trajectory: PyTree, inputs: PyTree) -> Bool[Array, " t"]:
@@ -192,14 +192,16 @@ def shape_of_trajectory(model: Any, length: int) -> PyTree:
 
 def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> PyTree:
     """The trajectory as arrays of the states' types; a `ValueError` for one of other shapes."""
-    like, own = shape_of_trajectory(model, length), as_arrays(trajectory, "trajectory")
+    like, arrays = shape_of_trajectory(model, length), as_arrays(trajectory, "trajectory")
 
     def convert(leaf: Any, state: jax.ShapeDtypeStruct) -> Any:
         may_be = np.can_cast(jnp.result_type(leaf), state.dtype, "same_kind")
         return jnp.asarray(leaf, state.dtype) if may_be else leaf
 
-    if jax.tree.structure(own) == jax.tree.structure(like):
-        own = jax.tree.map(convert, own, like)
-    if kinds(own) != kinds(like):
-        raise ValueError(f"trajectory: {kinds(own)} is not {kinds(like)}, x_0 and a state a step")
-    return own
+    if jax.tree.structure(arrays) == jax.tree.structure(like):
+        arrays = jax.tree.map(convert, arrays, like)
+    if kinds(arrays) != kinds(like):
+        raise ValueError(
+            f"trajectory: {kinds(arrays)} is not {kinds(like)}, x_0 and a state per step"
+        )
+    return arrays

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.checks import checked
 from mpfjax.mixture import MarginalisedState, ParticleMixture
-from mpfjax.models.observations import refused_where
+from mpfjax.models.observations import refuse_where
 from mpfjax.operations.stored import count_places, take
 from mpfjax.running.scan import FilterRun
 
@@ -28,7 +28,7 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     mixtures = jax.vmap(lambda mixture: mixture.replace(memory={}))(mixtures)
     began_anew = jax.vmap(lambda mixture: mixture.began_anew)(mixtures)
     began_anew &= mixtures.log_weights > -jnp.inf
-    mixtures = refused_where(jnp.any(began_anew), mixtures, f"mixtures: {NO_PAST}")
+    mixtures = refuse_where(jnp.any(began_anew), mixtures, f"mixtures: {NO_PAST}")
     if not is_run:
         return mixtures
     initial = run.initial.replace(memory={})
@@ -43,7 +43,7 @@ def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:
     """The mixtures; an error where a particle comes from no single one of the step before."""
     is_orphan = (mixtures.ancestor_indices < 0) & (mixtures.log_weights > -jnp.inf)
     what = "follows ancestors, and particles of index below 0 have no single one, as after restarts"
-    return refused_where(jnp.any(is_orphan[1:]), mixtures, f"mixtures: {needed_by} {what}")
+    return refuse_where(jnp.any(is_orphan[1:]), mixtures, f"mixtures: {needed_by} {what}")
 
 
 def ancestors_of(particles: Int[Array, " k"], mixtures: ParticleMixture) -> Int[Array, "t k"]:

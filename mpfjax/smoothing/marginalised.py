@@ -24,20 +24,20 @@ from mpfjax.models.base import with_inputs
 from mpfjax.models.gaussians import (
     Gaussian,
     Linear,
-    applied,
+    apply,
     cholesky,
     particles_first,
     product,
-    sandwiched,
+    sandwich,
     solve_lower,
     symmetric,
-    transposed,
+    transpose,
     without_missing,
 )
 from mpfjax.models.law import law_of
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
-from mpfjax.smoothing.backward import draw_ends, draw_exactly, ended, rows_at
+from mpfjax.smoothing.backward import append_last, draw_ends, draw_exactly, rows_at
 
 
 class Information(NamedTuple):
@@ -74,29 +74,29 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     def back(carry: tuple[PyTree, Information], step: Any) -> tuple[Any, Any]:
         latent, future = carry
         step_key, earlier, observation, now = step
-        moved_by = with_inputs(model, now)
-        indices = _indices(step_key, moved_by, observation, latent, future, earlier)
+        model_now = with_inputs(model, now)
+        indices = _indices(step_key, model_now, observation, latent, future, earlier)
         before = rows_at(indices, earlier.particles)
-        future = _before(moved_by, observation, latent, before, future)
+        future = _before(model_now, observation, latent, before, future)
         return (before.latent, future), (before.latent, future, indices)
 
     def forth(state: MarginalisedState, step: Any) -> tuple[Any, Any]:
         latent, observation, now = step
-        moved_by = with_inputs(model, now)
-        state, _ = linear.updated(moved_by, observation, linear.predicted(moved_by, latent, state))
+        model_now = with_inputs(model, now)
+        state, _ = linear.update(model_now, observation, linear.predict(model_now, latent, state))
         return state, state
 
     nothing = _nothing(end.mean)
     earlier = jax.tree.map(lambda leaf: leaf[:-1], mixtures)
     steps = (jax.random.split(key_steps, length), earlier, observations, inputs)
     _, past = jax.lax.scan(back, (end.latent, nothing), steps, reverse=True)
-    latents, futures, indices = ended(past, (end.latent, nothing, last))
+    latents, futures, indices = append_last(past, (end.latent, nothing, last))
     following = jax.tree.map(lambda leaf: leaf[1:], latents)
     start = linear.with_moments(model, jax.tree.map(lambda leaf: leaf[0], latents))
     _, later = jax.lax.scan(forth, start, (following, observations, inputs))
     filtered = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows]), start, later)
-    found = jax.vmap(_smoothed)(filtered, futures)
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), found), indices
+    smoothed = jax.vmap(_smoothed)(filtered, futures)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), smoothed), indices
 
 
 def _nothing(mean: Float[Array, "n d"]) -> Information:
@@ -104,27 +104,27 @@ def _nothing(mean: Float[Array, "n d"]) -> Information:
     return Information(jnp.zeros((d, d, n), mean.dtype), jnp.zeros((d, n), mean.dtype), mean.T)
 
 
-def _joined(one: Information, other: Information) -> Information:
-    """Both, which have one centre."""
+def _add(one: Information, other: Information) -> Information:
+    """The product of two likelihoods that have one centre."""
     return Information(one.precision + other.precision, one.vector + other.vector, one.centre)
 
 
-def _told(target: Float[Array, "p #n"], seen: Linear, law: Gaussian) -> Information:
+def _likelihood(target: Float[Array, "p #n"], emission: Linear, law: Gaussian) -> Information:
     """The likelihood of y = A x + b + N(0, C) as a function of x, around the mean of its law."""
-    known = sandwiched(seen.matrix, law.covariance)
+    signal = sandwich(emission.matrix, law.covariance)
     # Each variance of y is at least a share of that which x itself makes. With less, Ω would round
     # away what is known of x in other directions.
-    p, share = seen.noise.shape[0], float(jnp.finfo(seen.noise.dtype).eps) ** 0.5
-    own = jnp.stack([seen.noise[j, j] for j in range(p)])
-    least = share * jnp.stack([known[j, j] for j in range(p)])
-    least = jnp.where((own > 0) | (least > 0), least, 1.0)  # an exact y of an x known exactly
-    lacking = jnp.maximum(least - own, 0.0)[None]
-    noise = seen.noise + jnp.eye(p, dtype=own.dtype)[:, :, None] * lacking
+    p, share = emission.noise.shape[0], float(jnp.finfo(emission.noise.dtype).eps) ** 0.5
+    variances = jnp.stack([emission.noise[j, j] for j in range(p)])
+    least = share * jnp.stack([signal[j, j] for j in range(p)])
+    least = jnp.where((variances > 0) | (least > 0), least, 1.0)  # an exact y of an x known exactly
+    lacking = jnp.maximum(least - variances, 0.0)[None]
+    noise = emission.noise + jnp.eye(p, dtype=variances.dtype)[:, :, None] * lacking
     factor = cholesky(noise, floor=True)
-    rows = solve_lower(factor, seen.matrix)
-    missed = target - seen.offset - applied(seen.matrix, law.mean)
-    white = solve_lower(factor, missed[:, None])[:, 0]
-    return Information(product(transposed(rows), rows), applied(transposed(rows), white), law.mean)
+    rows = solve_lower(factor, emission.matrix)
+    innovation = target - emission.offset - apply(emission.matrix, law.mean)
+    white = solve_lower(factor, innovation[:, None])[:, 0]
+    return Information(product(transpose(rows), rows), apply(transpose(rows), white), law.mean)
 
 
 def _before(
@@ -132,32 +132,32 @@ def _before(
 ) -> Information:
     """The likelihood of y_{s+1}, z_{s+1} and all that follows as a function of x_s, given z_s."""
     dynamics, law = linear.dynamics_of(model, latent, before), linear.gaussian_of(before)
-    told = _nothing(before.mean)
+    likelihood = _nothing(before.mean)
     if linear.is_mixed(model):
         mixed, shared = linear.latent_dynamics_of(model, before)
         rows = linear.latent_rows(model, latent)
-        told = _told(rows, mixed, law)
-        dynamics = linear.decorrelated(dynamics, mixed, shared, rows)
-    seen = linear.emission_of(model, latent, before)
-    if seen is not None:
-        target = linear.observation_rows(model, observation, seen, before.mean.dtype)
-        target, seen, _ = without_missing(target, seen)
-        through = gaussians.through(dynamics, seen)
-        told = _joined(told, _told(target, through, law))
-        shared = product(dynamics.noise, transposed(seen.matrix))
-        dynamics = linear.decorrelated(dynamics, through, shared, target)
+        likelihood = _likelihood(rows, mixed, law)
+        dynamics = linear.decorrelate(dynamics, mixed, shared, rows)
+    emission = linear.emission_of(model, latent, before)
+    if emission is not None:
+        target = linear.observation_rows(model, observation, emission, before.mean.dtype)
+        target, emission, _ = without_missing(target, emission)
+        through = gaussians.through(dynamics, emission)
+        likelihood = _add(likelihood, _likelihood(target, through, law))
+        shared = product(dynamics.noise, transpose(emission.matrix))
+        dynamics = linear.decorrelate(dynamics, through, shared, target)
     matrix, offset, noise = dynamics
     precision, vector, centre = future
-    offset = offset + applied(matrix, law.mean) - centre
-    vector = vector - applied(precision, offset)
+    offset = offset + apply(matrix, law.mean) - centre
+    vector = vector - apply(precision, offset)
     root = cholesky(noise)
-    half = solve_lower(_one_plus(precision, root), transposed(product(precision, root)))
-    white = solve_lower(_one_plus(precision, root), applied(transposed(root), vector)[:, None])
+    half = solve_lower(_one_plus(precision, root), transpose(product(precision, root)))
+    white = solve_lower(_one_plus(precision, root), apply(transpose(root), vector)[:, None])
     white = white[:, 0]
-    precision = precision - product(transposed(half), half)
-    vector = vector - applied(transposed(half), white)
-    back = transposed(matrix)
-    return _joined(told, Information(sandwiched(back, precision), applied(back, vector), law.mean))
+    precision = precision - product(transpose(half), half)
+    vector = vector - apply(transpose(half), white)
+    back = transpose(matrix)
+    return _add(likelihood, Information(sandwich(back, precision), apply(back, vector), law.mean))
 
 
 def _one_plus(
@@ -166,7 +166,7 @@ def _one_plus(
     """The factor of I + Γᵀ Ω Γ."""
     d = precision.shape[0]
     identity = jnp.eye(d, dtype=precision.dtype)[:, :, None]
-    return cholesky(identity + sandwiched(transposed(root), precision), floor=True)
+    return cholesky(identity + sandwich(transpose(root), precision), floor=True)
 
 
 def _log_overlap(law: Gaussian, future: Information) -> Float[Array, " n"]:
@@ -174,11 +174,11 @@ def _log_overlap(law: Gaussian, future: Information) -> Float[Array, " n"]:
     precision, vector, centre = future
     root, away = cholesky(law.covariance), law.mean - centre
     factor = _one_plus(precision, root)
-    pulled = applied(precision, away)
-    white = solve_lower(factor, applied(transposed(root), vector - pulled)[:, None])[:, 0]
-    at_mean = applied(away[None], vector - 0.5 * pulled)[0]
+    pull = apply(precision, away)
+    white = solve_lower(factor, apply(transpose(root), vector - pull)[:, None])[:, 0]
+    at_mean = apply(away[None], vector - 0.5 * pull)[0]
     log_volume = sum(jnp.log(factor[j, j]) for j in range(factor.shape[0]))
-    return at_mean + 0.5 * applied(white[None], white)[0] - log_volume
+    return at_mean + 0.5 * apply(white[None], white)[0] - log_volume
 
 
 def _indices(
@@ -193,14 +193,14 @@ def _indices(
     n, state = earlier.log_weights.shape[0], earlier.particles
 
     def log_density(trajectory: tuple) -> Float[Array, " n"]:
-        own, *of_future = trajectory
-        copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), own)
+        one_latent, *of_future = trajectory
+        copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), one_latent)
         law = linear.predicted_gaussian(model, copies, state)
         log_density = law_of(model).log_transition(copies, state)
-        seen = linear.emission_of(model, copies, state)
-        if seen is not None:
-            rows = linear.observation_rows(model, observation, seen, state.mean.dtype)
-            law, log_factor = gaussians.update(law, rows, seen)
+        emission = linear.emission_of(model, copies, state)
+        if emission is not None:
+            rows = linear.observation_rows(model, observation, emission, state.mean.dtype)
+            law, log_factor = gaussians.update(law, rows, emission)
             log_density = log_density + log_factor
         one = Information(*(part[..., None] for part in of_future))
         return log_density + _log_overlap(law, one)
@@ -214,8 +214,8 @@ def _smoothed(state: MarginalisedState, future: Information) -> MarginalisedStat
     n, law = state.mean.shape[0], linear.gaussian_of(state)
     root = cholesky(law.covariance)
     factor = _one_plus(future.precision, root)
-    half = solve_lower(factor, transposed(root))
-    covariance = symmetric(product(transposed(half), half))
-    pull = future.vector - applied(future.precision, law.mean - future.centre)
-    mean = law.mean + applied(covariance, pull)
+    half = solve_lower(factor, transpose(root))
+    covariance = symmetric(product(transpose(half), half))
+    pull = future.vector - apply(future.precision, law.mean - future.centre)
+    mean = law.mean + apply(covariance, pull)
     return MarginalisedState(state.latent, particles_first(mean, n), particles_first(covariance, n))

@@ -14,7 +14,7 @@ from jaxtyping import Array, Int, Key, PyTree
 from mpfjax.checks import Checked, CountOrZero, check_one_each, checked, saying
 from mpfjax.filter import Filter, check_keep_parents
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import mapped, require, with_inputs
+from mpfjax.models.base import over_particles, require, with_inputs
 from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.observations import as_series, one_input, one_observation
 from mpfjax.operations.compiling import jit_with_floats_traced
@@ -104,37 +104,39 @@ def smoothed_sums(
 def _smooth(key, smoother, series, lag):
     # The first two are those of `run_filter`.
     key_initial, key_steps, key_backward = split(key, 3)
-    length, filter, num_kept = series.length, smoother.filter, smoother.lag + 1
+    length, filter, num_rows = series.length, smoother.filter, smoother.lag + 1
     step_keys = jax.random.split(key_steps, length)
     initial = first_mixture(key_initial, filter, series)
-    kept = smoother._no_terms(initial.particles)
+    terms = smoother._no_terms(initial.particles)
 
     def advance(carry: tuple[ParticleMixture, "Terms"], step: PyTree) -> Any:
-        mixture, kept = carry
+        mixture, terms = carry
         t, step_key, draw_key, now = step
         moved, info = step_or_predict(filter, step_key, mixture, now)
-        kept, values = smoother._of_pasts(draw_key, now.inputs, mixture, moved, kept)
+        terms, values = smoother._of_pasts(draw_key, now.inputs, mixture, moved, terms)
         if lag is None:
-            means = jax.tree.map(lambda old, new: old + new[None], kept.means, values.means)
-            kept = kept._replace(means=means)
+            means = jax.tree.map(lambda old, new: old + new[None], terms.means, values.means)
+            terms = terms._replace(means=means)
         else:
-            kept = jax.tree.map(lambda old, new: old.at[t % num_kept].set(new), kept, values)
+            terms = jax.tree.map(lambda old, new: old.at[t % num_rows].set(new), terms, values)
         # The sum, or term t - lag, which the next step overwrites; zero while there is none yet.
-        settled = kept.row((t + 1) % num_kept).estimates_in(moved)
-        return (moved, kept), (settled, report_of(info))
+        final_terms = terms.row((t + 1) % num_rows).estimates_in(moved)
+        return (moved, terms), (final_terms, report_of(info))
 
     keys = step_keys, jax.random.split(key_backward, length)
     steps = (jnp.arange(length, dtype=jnp.int32), *keys, series)
-    (final, kept), (settled, reports) = jax.lax.scan(advance, (initial, kept), steps)
+    (final, terms), (final_terms, reports) = jax.lax.scan(advance, (initial, terms), steps)
     run = run_of(initial, final, None, reports)
     if lag is None:
-        return SmoothedSums(settled.means, None, run)
-    rest = jax.vmap(lambda r: kept.row(r).estimates_in(final))(
-        np.arange(length - lag, length) % num_kept
+        return SmoothedSums(final_terms.means, None, run)
+    rest = jax.vmap(lambda r: terms.row(r).estimates_in(final))(
+        np.arange(length - lag, length) % num_rows
     )
-    terms = jax.tree.map(lambda done, rest: jnp.concatenate([done[lag:], rest]), settled, rest)
-    sums = jax.tree.map(lambda means: jnp.cumsum(means, axis=0), terms.means)
-    return SmoothedSums(sums, terms.means, run, terms.variances)
+    estimates = jax.tree.map(
+        lambda done, rest: jnp.concatenate([done[lag:], rest]), final_terms, rest
+    )
+    sums = jax.tree.map(lambda means: jnp.cumsum(means, axis=0), estimates.means)
+    return SmoothedSums(sums, estimates.means, run, estimates.variances)
 
 
 class Terms(NamedTuple):
@@ -153,11 +155,11 @@ class Terms(NamedTuple):
     def variances_in(self, mixture: ParticleMixture) -> PyTree:
         """Over all particles: the variance of the means, and the mean of the variances."""
         between = jax.tree.map(mixture.variance, self.means)
-        return jax.tree.map(jnp.add, between, jax.tree.map(mixture.average, self.variances))
+        return jax.tree.map(jnp.add, between, jax.tree.map(mixture.expectation, self.variances))
 
     def estimates_in(self, mixture: ParticleMixture) -> "Terms":
         """The moments over all particles of a mixture."""
-        return Terms(jax.tree.map(mixture.average, self.means), self.variances_in(mixture))
+        return Terms(jax.tree.map(mixture.expectation, self.means), self.variances_in(mixture))
 
 
 class Window(NamedTuple):
@@ -223,10 +225,12 @@ class FixedLagSmoother(Checked):
         `inputs` are u_t.
         """
         key_step, key_draws = jax.random.split(key)
-        seen = None if observation is None else one_observation(observation, self.filter.model)
-        moved, info = self.filter._run(key_step, window.mixture, seen, inputs)
+        observation = (
+            None if observation is None else one_observation(observation, self.filter.model)
+        )
+        moved, info = self.filter._run(key_step, window.mixture, observation, inputs)
         inputs = one_input(inputs, self.filter.model)
-        window, estimates = _advanced(self, key_draws, window, moved, inputs)
+        window, estimates = _advance(self, key_draws, window, moved, inputs)
         _check_sums(jax.tree.map(lambda leaf: leaf[-1], estimates))
         return window, estimates, info
 
@@ -285,7 +289,7 @@ class FixedLagSmoother(Checked):
     def _of_states(self, previous: PyTree, states: PyTree) -> PyTree:
         """h of these states; a `ValueError` unless it is one value a particle."""
         with saying("function", "called with x_{t-1} and x_t of all particles"):
-            values = mapped(self.filter.model, self.function)(previous, states)
+            values = over_particles(self.filter.model, self.function)(previous, states)
         check_one_each(jax.tree.leaves(states)[0].shape[0], function=values)
         return jax.tree.map(as_inexact, values)
 
@@ -311,7 +315,7 @@ def _over_draws(terms: Terms) -> Terms:
 
 
 @jit_with_floats_traced
-def _advanced(smoother: Any, key: Any, window: Window, moved: ParticleMixture, inputs: PyTree):
+def _advance(smoother: Any, key: Any, window: Window, moved: ParticleMixture, inputs: PyTree):
     """The next window, and the estimates."""
     terms, values = smoother._of_pasts(key, inputs, window.mixture, moved, window.terms)
     t = window.num_steps

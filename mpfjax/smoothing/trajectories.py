@@ -9,14 +9,15 @@ from jax.core import Tracer
 from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.checks import Count, CountOrZero, checked, warn
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, require, with_inputs
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
 from mpfjax.models.observations import (
     as_arrays,
-    gathered,
     present_steps,
-    refused_by,
+    refusal_of,
+    series_of,
     steps_of_inputs,
     with_gaps,
 )
@@ -25,11 +26,11 @@ from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing.backward import (
+    append_last,
     check_pasts,
     draw,
     draw_ends,
     draw_exactly,
-    ended,
     log_kernel_from,
     rows_at,
     walk,
@@ -44,7 +45,7 @@ _SMALL_SHARE = 0.1
 @checked
 def sample_trajectories(
     key: Key[Array, ""],
-    model: AbstractStateSpaceModel,
+    filter: Filter | AbstractStateSpaceModel,
     mixtures: FilterRun | ParticleMixture,
     num_trajectories: Count,
     *,
@@ -61,6 +62,7 @@ def sample_trajectories(
     Component indicators do not enter, because the weights are joint: a mixture filter is smoothed
     like any other.
 
+    - `filter`: the filter of the run. A model in its place works with a DeprecationWarning.
     - `mixtures`: a run of `run_filter(..., collect=None)`, or the mixtures that it collected.
     - `num_trajectories`: k. Leaves of the result are (k, t + 1, ...); (k, t, ...), without x_0, for
       mixtures alone.
@@ -85,10 +87,13 @@ def sample_trajectories(
     the fraction. Use it for estimates of the past. The genealogy of the particles
     (`trace_ancestors`) is exact as well, but has few distinct states at early times.
     """
+    model = filter.model if isinstance(filter, Filter) else filter
+    if not isinstance(filter, Filter):
+        warn("filter: sample_trajectories now takes the filter, not its model", DeprecationWarning)
     if not is_mixed(model):
         require(model, "log_transition", "sample_trajectories")
     stacked = mixtures_of(mixtures)
-    series = gathered(observations, inputs)
+    series = series_of(observations, inputs)
     inputs, observations = series.inputs, series.observations
     # Those of the steps from each of the mixtures to the next.
     length = stacked.log_weights.shape[0]
@@ -101,20 +106,20 @@ def sample_trajectories(
         _check_component(stacked, component)
     if is_marginalised(model) or observations is not None:
         observations = as_arrays(observations)
-        present = present_steps(observations, series, refused_by(model))
+        present = present_steps(observations, series, refusal_of(model))
         observations = with_gaps(observations, present)
         check_marginalised(model, stacked, observations, method)
-        drawn, indices = sample_marginalised(
+        paths, indices = sample_marginalised(
             key, model, stacked, observations, inputs, num_trajectories, component
         )
     else:
         if method == "mcmc":
             stacked = with_parents(stacked, "sample_trajectories with method 'mcmc', not 'exact',")
         options = (num_trajectories, component, 0 if method == "exact" else num_moves)
-        drawn, indices = draw_trajectories(key, model, stacked, inputs, *options)
+        paths, indices = draw_trajectories(key, model, stacked, inputs, *options)
     check_pasts(indices)
     _warn_of_few(indices, stacked)
-    return drawn
+    return paths
 
 
 def _check_component(mixtures: ParticleMixture, component: int) -> None:
@@ -136,14 +141,14 @@ def draw_trajectories(key, model, mixtures, inputs, num_trajectories, component=
     def back(carry: tuple[PyTree, Array], step: Any) -> tuple[tuple[PyTree, Array], PyTree]:
         next_states, next_indices = carry
         step_key, earlier, ancestors, proposed, now = step
-        moved_by = with_inputs(model, now)
+        model_now = with_inputs(model, now)
         if proposed is None:
-            log_kernel = log_kernel_from(moved_by, earlier)
-            drawn = draw_exactly(step_key, log_kernel, next_states, earlier)
-            indices = drawn[:, 0]
+            log_kernel = log_kernel_from(model_now, earlier)
+            draws = draw_exactly(step_key, log_kernel, next_states, earlier)
+            indices = draws[:, 0]
         else:
             start = take(ancestors, jnp.maximum(next_indices, 0))
-            indices = walk(step_key, moved_by, next_states, earlier, start, proposed)[-1]
+            indices = walk(step_key, model_now, next_states, earlier, start, proposed)[-1]
         states = rows_at(indices, earlier.particles)
         return (states, indices), (states, indices)
 
@@ -158,7 +163,7 @@ def draw_trajectories(key, model, mixtures, inputs, num_trajectories, component=
     keys = jax.random.split(key_steps, num_earlier)
     steps = (keys, earlier, ancestors, proposed, inputs)
     _, past = jax.lax.scan(back, (states, last), steps, reverse=True)
-    states, indices = ended(past, (states, last))
+    states, indices = append_last(past, (states, last))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states), indices
 
 

@@ -49,11 +49,13 @@ class _KeepEveIndices(AbstractMove):
             return hasattr(node, "scheme") or hasattr(node, "noise")
 
         for part in [now, *jax.tree.leaves(moves, is_leaf=draws)]:
-            for option, known in _INDEPENDENT.items():
-                chosen, name = getattr(part, option, known), type(part).__name__
-                if chosen != known:
+            for option, independent in _INDEPENDENT.items():
+                chosen, name = getattr(part, option, independent), type(part).__name__
+                if chosen != independent:
                     name = "the filter" if part is now else name
-                    raise ValueError(f"filter: {option} of {name} is {chosen!r}, not {known!r}")
+                    raise ValueError(
+                        f"filter: {option} of {name} is {chosen!r}, not {independent!r}"
+                    )
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
@@ -65,7 +67,7 @@ class _KeepEveIndices(AbstractMove):
 
 @checked
 def with_eve_indices(filter: Filter) -> Filter:
-    """The same filter, which also remembers the Eve index of each particle.
+    """A copy of the filter that also stores the Eve index of each particle.
 
     Draws and weights are the same to the bit, but that no `SelectInitial` chooses x_0: what it
     keeps are no independent draws. A step takes O(N) more memory and time, and the runs
@@ -77,8 +79,8 @@ def with_eve_indices(filter: Filter) -> Filter:
     """
     if any(isinstance(move, _KeepEveIndices) for move in filter.initial_moves):
         return filter
-    kept = [move for move in filter.initial_moves if not move.weighs]
-    return filter.replace(initial_moves=[*kept, _KeepEveIndices()])
+    initial_moves = [move for move in filter.initial_moves if not move.weighs]
+    return filter.replace(initial_moves=[*initial_moves, _KeepEveIndices()])
 
 
 @checked
@@ -209,8 +211,8 @@ def batch_estimate(
       particles each are a good choice. Take enough particles that log Ẑ of a single run has a
       standard deviation of about one or less. Otherwise a few runs have most of the weight; see
       `effective_runs`.
-    - `quantity`: a function of one mixture, such as `lambda m: m.average(m.particles > 0)`. For a
-      mass take the probability of a place or an event, since the labels of components differ
+    - `quantity`: a function of one mixture, such as `lambda m: m.expectation(m.particles > 0)`. For
+      a mass take the probability of a place or an event, since the labels of components differ
       between runs.
 
     Runs of zero likelihood have no weight. Raises `ValueError` for fewer runs, and for anything but
@@ -223,11 +225,13 @@ def batch_estimate(
     values = jax.vmap(quantity)(runs.final)
     # Each run is left out in turn; a difference of sums would be lost to rounding.
     stays = jnp.concatenate([jnp.ones((1, number), bool), ~jnp.eye(number, dtype=bool)])
-    kept = jnp.where(stays, logs[None], -jnp.inf)
+    log_evidences = jnp.where(stays, logs[None], -jnp.inf)
     estimates = jax.vmap(lambda shares: jnp.tensordot(shares, values, axes=1))(
-        jax.nn.softmax(kept, axis=1).astype(values.dtype)
+        jax.nn.softmax(log_evidences, axis=1).astype(values.dtype)
     )
-    log_z = jax.vmap(log_sum_exp)(kept) - jnp.log(jnp.sum(stays, axis=1).astype(logs.dtype))
+    log_z = jax.vmap(log_sum_exp)(log_evidences) - jnp.log(
+        jnp.sum(stays, axis=1).astype(logs.dtype)
+    )
     shares = jax.nn.softmax(logs)
     return BatchEstimate(
         value=estimates[0],

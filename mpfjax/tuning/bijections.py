@@ -35,11 +35,11 @@ class Unconstrained(AbstractTransform):
     """The parameter as it is."""
 
     def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The same numbers."""
+        """The argument itself."""
         return reals
 
     def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The same numbers."""
+        """The argument itself."""
         return value
 
     def contains(self, value: Float[np.ndarray, "..."]) -> bool:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Rule, kinds, warn
 from mpfjax.filter import Filter
-from mpfjax.models.observations import Series, as_series, gathered
+from mpfjax.models.observations import Series, as_series, series_of
 from mpfjax.moves.base import AbstractProposal, all_of
 from mpfjax.running.scan import FilterRun, scan
 from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, placed, pose
@@ -92,7 +92,7 @@ def pose_evidence(
 
 def one_sequence(observations: PyTree, model: Any) -> Series:
     """The data of one sequence; a `ValueError` for a list of several."""
-    if isinstance(gathered(observations).observations, list):
+    if isinstance(series_of(observations).observations, list):
         raise ValueError("observations: a list, of several sequences; jnp.asarray makes it one")
     return as_series(observations, model)
 

@@ -53,8 +53,8 @@ class LabelLikelihood(eqx.Module):
         @jax.checkpoint
         def of_frame(data: tuple[PyTree, PyTree, PyTree]) -> Float[Array, " k"]:
             observation, label, rivals = data
-            own = jax.tree.map(lambda leaf: leaf[:, None], label)
-            states = jax.tree.map(lambda *both: jnp.concatenate(both, axis=1), own, rivals)
+            first = jax.tree.map(lambda leaf: leaf[:, None], label)
+            states = jax.tree.map(lambda *both: jnp.concatenate(both, axis=1), first, rivals)
             k, n = jax.tree.leaves(states)[0].shape[:2]
             flat = jax.tree.map(lambda leaf: leaf.reshape(k * n, *leaf.shape[2:]), states)
             logs = law_of(model).log_likelihood(observation, flat).reshape(k, n)

@@ -32,7 +32,7 @@ class Sampler(eqx.Module):
     num_moves: int = eqx.field(static=True)
 
     def with_particles(self, num_particles: int) -> "Sampler":
-        """The same with filters of another number of particles."""
+        """The sampler with filters of another number of particles."""
         if num_particles == self.problem.tree.num_particles:
             return self
         resized = self.problem.tree.replace(num_particles=num_particles)
@@ -88,7 +88,7 @@ Weighed = tuple[ParticleMixture, Float[Array, ""], Float[Array, ""], Int[Array, 
 size, and how many θs were dropped, since their likelihood was NaN or +inf."""
 
 
-def _weighed(
+def _reweight(
     samples: ParticleMixture,
     points: Point,
     log_factors: Float[Array, " n"],
@@ -118,7 +118,7 @@ def extended(key, sampler, samples, t):
     keys = jax.random.split(key, samples.num_particles)
     extend = jax.vmap(sampler.extend, in_axes=(0, 0, None))
     points, increments = extend(keys, samples.particles, t)
-    return _weighed(samples, points, number_or_zero(increments), is_invalid(increments))
+    return _reweight(samples, points, number_or_zero(increments), is_invalid(increments))
 
 
 @jit_on_wide_vectors
@@ -130,8 +130,8 @@ def rejuvenated(key, sampler, samples, num_steps):
     """
     key_resample, key_moves = jax.random.split(key)
     points = jax.vmap(lambda reals: ravel_pytree(reals)[0])(samples.particles.reals)
-    centred = points - samples.average(points)[None]
-    factor = factor_of(samples.average(centred[:, :, None] * centred[:, None, :]))
+    centred = points - samples.expectation(points)[None]
+    factor = factor_of(samples.expectation(centred[:, :, None] * centred[:, None, :]))
     num_moves = sampler.num_moves
     num_chains = samples.num_particles // (num_moves + 1)
     # Multinomial, whose families say how large the error of the evidence is.
@@ -173,4 +173,4 @@ def exchanged(key, sampler, samples, num_steps):
     run_again = jax.vmap(sampler.run_again, in_axes=(0, 0, None))
     points, invalid = run_again(keys, samples.particles.reals, num_steps)
     ratios = points.log_likelihood - samples.particles.log_likelihood
-    return _weighed(samples, points, ratios, invalid["log_marginal_likelihood"])
+    return _reweight(samples, points, ratios, invalid["log_marginal_likelihood"])

@@ -100,7 +100,7 @@ class Problem(eqx.Module):
         return self.having(self.constrain(reals))
 
     def having(self, values: Mapping[str, Any]) -> Any:
-        """The same with parameters on their own scale."""
+        """The tree with these parameters, on their own scale."""
         leaves = list(self.leaves)
         for name, index in self.tuned:
             leaves[index] = values[name]
@@ -146,7 +146,7 @@ def pose(
 ) -> Problem:
     """The problem; a `ValueError` for arguments that do not make one."""
     leaves, structure = jax.tree.flatten(tree)
-    tuned = _tuned(tree, parameters)
+    tuned = _places_of(tree, parameters)
     if not tuned:
         raise ValueError(f"parameters: there are none; name floats, or declare them {_DECLARED}")
     for name, index in tuned.items():
@@ -185,14 +185,14 @@ def _as_array(name: str, value: Any) -> Array:
     raise ValueError(f"parameters: {name}, {shown(value)}, is no float; declare it {_DECLARED}")
 
 
-def _tuned(tree: PyTree, parameters: Parameters) -> dict[str, int]:
+def _places_of(tree: PyTree, parameters: Parameters) -> dict[str, int]:
     """Each parameter's name, and its place among the tree's leaves."""
     if parameters is None:
         parameters = {"": lambda tree: getattr(tree, "model", tree)}
     leaves, places = jax.tree.leaves(tree), placed(tree)
     tuned: dict[str, int] = {}
     for name, where in parameters.items():
-        for inner, index in _picked(name, where, places, leaves).items():
+        for inner, index in _pick(name, where, places, leaves).items():
             if index in tuned.values():
                 twice = next(other for other in tuned if tuned[other] == index)
                 raise ValueError(f"parameters: {twice} and {inner} pick the same number")
@@ -200,7 +200,7 @@ def _tuned(tree: PyTree, parameters: Parameters) -> dict[str, int]:
     return tuned
 
 
-def _picked(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[str, int]:
+def _pick(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[str, int]:
     """The leaves that one entry of the mapping selects: a leaf, or the arrays of a node."""
     try:
         picked = where(places)
@@ -209,8 +209,8 @@ def _picked(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[st
     picks = jax.tree_util.tree_leaves_with_path(picked)
     for _, place in picks:
         if not isinstance(place, Place):
-            said = f"{name} picks {shown(place)}, a static field or a new value"
-            raise ValueError(f"parameters: {said}; declare its field {_DECLARED}")
+            what = f"{name} picks {shown(place)}, a static field or a new value"
+            raise ValueError(f"parameters: {what}; declare its field {_DECLARED}")
     if len(picks) > 1 or not name:  # a network has functions among its leaves
         picks = [pick for pick in picks if eqx.is_inexact_array(leaves[pick[1].index])]
     if not picks and name:

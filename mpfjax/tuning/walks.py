@@ -96,9 +96,9 @@ def metropolis_step(
     return chosen(accepted, proposed, point), accepted, invalid
 
 
-def checked_deviations(given: float | Mapping[str, Any], start: Reals) -> Reals:
+def checked_deviations(values: float | Mapping[str, Any], start: Reals) -> Reals:
     """The deviation of each unconstrained number; a `ValueError` for anything else."""
-    by_name = given if isinstance(given, Mapping) else dict.fromkeys(start, given)
+    by_name = values if isinstance(values, Mapping) else dict.fromkeys(start, values)
     if set(by_name) != set(start):
         raise ValueError(f"proposal_deviations: those of {sorted(by_name)}, not of {sorted(start)}")
     deviations = {}

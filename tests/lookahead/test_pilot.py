@@ -55,9 +55,9 @@ def test_where_a_step_is_narrow_three_quarters_of_the_likelihood_are_trusted():
 def test_it_lowers_the_mean_squared_error_of_log_z_on_the_mirror_image():
     """With keys that nothing was chosen on; a third of the variance is expected."""
     model, num_runs = Mirror(), 120
-    observations = model.simulated(40, 0)
+    observations = model.simulate(40, 0)
     keys = jax.random.split(jax.random.key(77), num_runs)
-    plain = mpfjax.with_point_sets(mpfjax.mixture_particle_filter(model, 400, 4))
+    plain = mpfjax.with_quasi_monte_carlo(mpfjax.mixture_particle_filter(model, 400, 4))
     before, after = (
         np.var(mpfjax.monte_carlo(keys, filter, observations).log_marginal_likelihood)
         for filter in (plain, mpfjax.with_lookahead(plain))

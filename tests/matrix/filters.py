@@ -78,12 +78,12 @@ RECIPES: dict[str, Callable[[Any], Filter]] = {
     ),
 }
 TRANSFORMS: dict[str, Callable[[Filter], Filter]] = {
-    "point sets": mpfjax.with_point_sets,
+    "point sets": mpfjax.with_quasi_monte_carlo,
     "score": mpfjax.with_score_gradient,
     "two draws": lambda filter: mpfjax.with_proposals_per_particle(filter, 2),
     "look-ahead": mpfjax.with_lookahead,
-    "selected start": mpfjax.with_selected_start,
-    "start": lambda filter: mpfjax.with_start(filter, 2),
+    "selected start": mpfjax.with_initial_selection,
+    "start": lambda filter: mpfjax.with_initialisation(filter, 2),
     "restarts": lambda filter: mpfjax.with_restarts(filter, num_observations=2),
     "alarm": lambda filter: mpfjax.with_alarm(filter, 16),
     "families": lambda filter: mpfjax.with_eve_indices(

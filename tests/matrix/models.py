@@ -288,7 +288,7 @@ def over_clutter(law, y, u):
     return exact.kalman(law._replace(shift=-np.log(CLUTTER)), y, u)
 
 
-def targets(law, **options):
+def estimate_targets(law, **options):
     """One object that is certain: expected once, never dying, always seen, without clutter."""
     sensor = mpfjax.ClutteredModel(OfNoise(law), 1.0, CLUTTER)
     return mpfjax.TargetsModel(sensor, Certain(law), 1.0, initial_number=1.0)
@@ -320,7 +320,7 @@ def moments_of(form: Form):
         row = jax.tree.map(lambda leaf: leaf[None], mixture.mean())
         values = form.value(mixture.particles)
         spread = mixture.variance(values)
-        return form.value(row)[0], spread + mixture.average(
+        return form.value(row)[0], spread + mixture.expectation(
             form.within(mixture.particles) + values * 0
         )
 
@@ -362,7 +362,7 @@ FORMS: dict[str, Form] = {
     "cluttered": Form(
         cluttered, rows=True, data="sets", offset=lambda model: model.object_model.law.c
     ),
-    "targets": Form(targets, rows=True, data="targets", offset=None, answer=over_clutter),
+    "targets": Form(estimate_targets, rows=True, data="targets", offset=None, answer=over_clutter),
     "periodic": Form(own(GoingRound)),
     "whole numbers": Form(
         own(Steps), lambda states: states.astype(float), answer=exact.enumerated, data="whole"

@@ -58,7 +58,7 @@ class Row:
         filter, series = self.filter(data), self.case(data).series
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            return mpfjax.monte_carlo(KEYS, filter, series, self.moments, slots=slots), caught
+            return mpfjax.monte_carlo(KEYS, filter, series, self.moments, num_slots=slots), caught
 
     def ratios(self, data, increments):
         """Ẑ/Z of each run, but for the steps without any likelihood."""
@@ -246,7 +246,7 @@ def of_run(method):
 
         def smooth(key):
             run = mpfjax.run_filter(key, filter, case.series)
-            paths = method(jax.random.fold_in(key, 7), filter.model, run, case.series)
+            paths = method(jax.random.fold_in(key, 7), filter, run, case.series)
             return run.log_likelihood_increments, jax.vmap(row.form.value)(paths).mean(axis=0)
 
         smoothed(row, data, smooth)
@@ -255,10 +255,10 @@ def of_run(method):
 
 
 def backward(**options):
-    def draw(key, model, run, series):
-        is_linear = hasattr(model, "dynamics")
+    def draw(key, filter, run, series):
+        is_linear = hasattr(filter.model, "dynamics")
         data = {"observations": series} if is_linear else {"inputs": series.inputs}
-        return smoothing.sample_trajectories(key, model, run, 8, **data, **options)
+        return smoothing.sample_trajectories(key, filter, run, 8, **data, **options)
 
     return of_run(draw)
 
@@ -285,7 +285,7 @@ def genealogy(row, data):
     def smooth(key):
         run = mpfjax.run_filter(key, filter, case.series)
         paths = smoothing.trace_ancestors(run).trajectories
-        means = run.final.average(jax.vmap(row.form.value)(paths))
+        means = run.final.expectation(jax.vmap(row.form.value)(paths))
         return run.log_likelihood_increments, means
 
     smoothed(row, data, smooth)
@@ -300,7 +300,7 @@ def conditional(row, data):
         run = mpfjax.run_filter(own, filter, case.series)
         path = jax.tree.map(
             lambda leaf: leaf[0],
-            smoothing.sample_trajectories(own, filter.model, run, 1, inputs=case.series.inputs),
+            smoothing.sample_trajectories(own, filter, run, 1, inputs=case.series.inputs),
         )
 
         def renewed(path, own):
@@ -323,15 +323,16 @@ def sampler(run):
     def ask(row, data):
         case, form = row.case(data), row.form
         shape = jnp.shape(form.offset(case.model))
-        common: dict[str, Any] = {
-            "parameters": {"c": lambda filter: form.offset(filter.model)},
-            "progress": False,
-        }
 
         def sample_prior(key):
             return {"c": jax.random.normal(key, shape)}
 
-        found = run(row, data, sample_prior, common)
+        options = {
+            "parameters": {"c": lambda filter: form.offset(filter.model)},
+            "sample_prior": sample_prior,
+            "progress": False,
+        }
+        found = run(row, data, options)
         mean, variance = exact.posterior(case.law, case.y, case.u, answer=form.answer)
         gaps = (np.asarray(found, float) - mean) / np.sqrt(variance)
         assert_unbiased(gaps, 0.0, loosest=0.15)
@@ -339,36 +340,30 @@ def sampler(run):
     return ask
 
 
-CHAINS: dict[str, Any] = {"num_chains": 60, "burn_in": 10}
+WALK: dict[str, Any] = {"log_prior": log_prior, "proposal_deviations": 0.8}
 
 
-def of_chains(posterior):
+def of_chains(method, row, data, **options):
+    case = row.case(data)
+    posterior = method(
+        KEYS[0], row.filter(data), case.series, 40, num_chains=60, burn_in=10, **options
+    )
     draws = np.asarray(posterior.parameters["c"], float)
     return draws.reshape(*draws.shape[:2], -1)[..., 0].mean(axis=1)
 
 
 @sampler
-def metropolis(row, data, sample_prior, common):
-    return of_chains(
-        tuning.metropolis_hastings(
-            KEYS[0], row.filter(data), row.case(data).series, 40, log_prior=log_prior,
-            sample_prior=sample_prior, proposal_deviations=0.8, **CHAINS, **common,
-        )
-    )  # fmt: skip
+def metropolis(row, data, options):
+    return of_chains(tuning.metropolis_hastings, row, data, **WALK, **options)
 
 
 @sampler
-def gibbs(row, data, sample_prior, common):
-    return of_chains(
-        tuning.particle_gibbs(
-            KEYS[0], row.filter(data), row.case(data).series, 40, log_prior=log_prior,
-            sample_prior=sample_prior, proposal_deviations=0.8, **CHAINS, **common,
-        )
-    )  # fmt: skip
+def gibbs(row, data, options):
+    return of_chains(tuning.particle_gibbs, row, data, **WALK, **options)
 
 
 @sampler
-def gibbs_draw(row, data, sample_prior, common):
+def gibbs_draw(row, data, options):
     """The draw's own formula leaves out what is NaN, as it is told to."""
     value, r = row.form.value, row.case(data).law.r
 
@@ -380,24 +375,13 @@ def gibbs_draw(row, data, sample_prior, common):
         shape = jnp.shape(row.form.offset(model))
         return {"c": mean + jax.random.normal(key, shape) / jnp.sqrt(precision)}
 
-    return of_chains(
-        tuning.particle_gibbs(
-            KEYS[0], row.filter(data), row.case(data).series, 40, draw=draw,
-            sample_prior=sample_prior, **CHAINS, **common,
-        )
-    )  # fmt: skip
+    return of_chains(tuning.particle_gibbs, row, data, draw=draw, **options)
 
 
 @sampler
-def smc2(row, data, sample_prior, common):
-    keys = jax.random.split(jax.random.key(1), 8)
-    found = [
-        tuning.smc2(
-            key, row.filter(data), row.case(data).series, 120, log_prior=log_prior,
-            sample_prior=sample_prior, **common,
-        ).mean("c")
-        for key in keys
-    ]  # fmt: skip
+def smc2(row, data, options):
+    keys, data = jax.random.split(jax.random.key(1), 8), (row.filter(data), row.case(data).series)
+    found = [tuning.smc2(key, *data, 120, log_prior=log_prior, **options).mean("c") for key in keys]
     return np.reshape(found, (8, -1))[:, 0]
 
 

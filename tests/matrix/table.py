@@ -103,8 +103,8 @@ RULES = (
     Rule("derivatives do not see", "",
          filters=these("with start > score", "with restarts > score")),
     Rule("log_initial|initial_from_noise|density|conditionally linear",
-         "`with_start` and `with_restarts` need a density of x_0 and a state that is sampled "
-         "entirely, in floating point",
+         "`with_initialisation` and `with_restarts` need a density of x_0 and a state that is "
+         "sampled entirely, in floating point",
          forms=LINEAR | these("three methods", "one of several", "targets", "whole numbers"),
          filters=BEGUN),
     Rule("already", "", filters=these("with start > start")),

@@ -20,8 +20,8 @@ from mpfjax.moves.resampling.sorting import (
 )
 from mpfjax.operations.random import (
     direction_numbers,
+    scramble,
     scrambled_directions,
-    shuffled,
     sobol_points,
 )
 
@@ -103,7 +103,7 @@ def cell_counts(points, digits):
 def test_shuffled_indices_are_a_permutation_that_keeps_blocks_together():
     seeds = jax.random.bits(jax.random.key(0), (50,), jnp.uint32)
     num_digits, n = 10, 1 << 10
-    places = eqx.filter_jit(jax.vmap(lambda seed: shuffled(jnp.arange(n), seed, num_digits)))
+    places = eqx.filter_jit(jax.vmap(lambda seed: scramble(jnp.arange(n), seed, num_digits)))
     found = np.asarray(places(seeds)).astype(int)
     np.testing.assert_array_equal(np.sort(found, axis=1), np.tile(np.arange(n), (50, 1)))
     for k in range(num_digits):

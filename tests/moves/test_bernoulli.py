@@ -179,7 +179,7 @@ def test_one_scan_is_that_of_all_associations(apart):
     of_none = 1 - shares.sum(axis=1)
     old = of_none * r * (1 - P_D) / missed + shares.sum(axis=1)
     new = (1 - shares.sum(axis=0)) * births / (1 + births)
-    found = mpfjax.targets(moved)
+    found = mpfjax.estimate_targets(moved)
     close = 1e-3 if apart > 10 else 0.12
     by_label = dict(zip(np.asarray(found.labels), np.asarray(found.existence), strict=True))
     np.testing.assert_allclose([by_label[k] for k in (1, 2, 3)], old, atol=close)
@@ -209,7 +209,7 @@ def test_a_known_single_object_is_that_of_all_associations():
             return mixture, info.log_likelihood_increment
 
         mixture, increments = jax.lax.scan(step, mixture, (keys[1:], sets))
-        return jnp.sum(increments), mpfjax.targets(mixture).means[0, 0]
+        return jnp.sum(increments), mpfjax.estimate_targets(mixture).means[0, 0]
 
     run_all = jax.jit(jax.vmap(run, in_axes=(0, None, None)))
     keys = jax.random.split(KEY, 200)
@@ -283,7 +283,9 @@ def test_objects_not_detected_yet_are_those_of_gaussian_sums(proposal):
         proposal=proposal,
     )  # fmt: skip
     scans = jnp.asarray([[[-2.5], [2.0]], [[second], [NAN]]], jnp.float32)
-    runs = mpfjax.monte_carlo(jax.random.split(KEY, 20), filter, scans, collect=mpfjax.targets)
+    runs = mpfjax.monte_carlo(
+        jax.random.split(KEY, 20), filter, scans, collect=mpfjax.estimate_targets
+    )
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[:, -1], runs.collected)
     found = np.stack([np.where(last.labels == k, last.existence, 0).sum(1) for k in (1, 2, 3)], 1)
     # Labels of the first scan are dealt by the most probable.
@@ -311,7 +313,7 @@ def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
         moved, info = filter.step(KEY, mixture, scans)
         total = 1 - r + likelihood
         np.testing.assert_allclose(info.log_likelihood_increment, np.log(total), atol=1e-4)
-        found = mpfjax.targets(moved)
+        found = mpfjax.estimate_targets(moved)
         assert found.labels.tolist() == [1, 0]
         np.testing.assert_allclose(found.existence, [likelihood / total, 0], atol=1e-4)
     moved, info = filter.predict(KEY, mixture)
@@ -331,7 +333,7 @@ def test_two_components_of_one_object_become_one():
     ):  # fmt: skip
         states = near + gap * np.arange(2)[:, None]
         moved = filter.predict(KEY, bernoulli_mixture(filter, states[..., None], existence))[0]
-        found = mpfjax.targets(moved)
+        found = mpfjax.estimate_targets(moved)
         np.testing.assert_allclose(found.existence, 0.95 * np.array(expected), atol=1e-3)
         assert found.labels.tolist() == [1, 2 if expected[1] else 0]
 
@@ -369,7 +371,7 @@ def test_objects_without_room_are_told_and_the_table_has_the_rest():
     crowd = TargetsModel(sensor, Birth(jnp.float32(2.0)), 0.95)
     scans = jnp.tile(jnp.array([[-2.0], [0.0], [2.0]]), (3, 1, 1))
     run = mpfjax.run_filter(
-        KEY, mpfjax.bernoulli_filter(crowd, 900, 2), scans, collect=mpfjax.targets
+        KEY, mpfjax.bernoulli_filter(crowd, 900, 2), scans, collect=mpfjax.estimate_targets
     )
     with pytest.warns(RuntimeWarning, match="there was no room at step 1"):
         table = mpfjax.track_table(run.collected)
@@ -378,8 +380,8 @@ def test_objects_without_room_are_told_and_the_table_has_the_rest():
     assert len(set(zip(table["step"], table["label"], strict=True))) == 6
     # The others still count.
     np.testing.assert_allclose(run.collected.expected_number[-1], 3, atol=0.7)
-    with pytest.raises(ValueError, match="slots: "):
-        mpfjax.monte_carlo(KEY[None], mpfjax.bernoulli_filter(crowd, 900, 2), scans, slots=600)
+    with pytest.raises(ValueError, match="num_slots: "):
+        mpfjax.monte_carlo(KEY[None], mpfjax.bernoulli_filter(crowd, 900, 2), scans, num_slots=600)
     with pytest.raises(ValueError, match="not for islands"):
         mpfjax.run_islands(KEY, mpfjax.bernoulli_filter(crowd, 900, 2), scans, num_islands=2)
     with pytest.raises(ValueError, match="model: "):
@@ -401,12 +403,12 @@ def test_every_way_to_run_takes_inputs_and_missing_scans(tmp_path):
     scans = jnp.array([0.2, 5.1, NAN, 15.3])[:, None, None]
     inputs, present = np.array([[0.0], [5.0], [5.0], [5.0]], np.float32), np.arange(4) != 2
     series = mpfjax.Series(scans.at[2].set(0.0), inputs, present=present)
-    run = mpfjax.run_filter(keys[0], filter, series, collect=mpfjax.targets)
+    run = mpfjax.run_filter(keys[0], filter, series, collect=mpfjax.estimate_targets)
     np.testing.assert_allclose(run.collected.means[1:, 0, 0], [5, 10, 15], atol=0.8)
     assert run.collected.number.tolist() == [1, 1, 1, 1]
     mpfjax.save_checkpoint(tmp_path / "final", run.final)
     again = mpfjax.load_checkpoint(tmp_path / "final", filter.init(KEY))
-    np.testing.assert_array_equal(mpfjax.targets(again).labels, run.collected.labels[-1])
+    np.testing.assert_array_equal(mpfjax.estimate_targets(again).labels, run.collected.labels[-1])
     study = mpfjax.Study({"bernoulli": build}, [300], keys, series)
     (cell,) = mpfjax.run_study(study, tmp_path / "study")
     total = run.log_marginal_likelihood
@@ -425,7 +427,7 @@ def test_the_number_is_that_of_independent_events():
 def test_quantiles_are_those_of_each_object():
     states = np.stack([np.linspace(0, 1, 101), np.linspace(5, 7, 101)])[..., None]
     filter = Filter(model(), [Predict(), Associate(undetected_particles=10)], 212, 3)
-    found = mpfjax.targets(bernoulli_mixture(filter, states, [0.5, 0.25]), q=(0.1, 0.5))
+    found = mpfjax.estimate_targets(bernoulli_mixture(filter, states, [0.5, 0.25]), q=(0.1, 0.5))
     np.testing.assert_allclose(found.quantiles[..., 0], [[0.1, 0.5], [5.2, 6.0]], atol=0.03)
     np.testing.assert_allclose(found.existence, [0.5, 0.25], atol=1e-6)
 

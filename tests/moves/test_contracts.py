@@ -70,7 +70,7 @@ def test_regrouping_treats_every_copy_of_a_particle_alike(name):
     )
     labels, found = (
         np.asarray(moved_by(REGROUPINGS[name], jax.random.key(0), m).component_indicators)
-        for m in (ORDINARY, twice.weighed(jnp.full(1, -np.log(2).astype(np.float32))))
+        for m in (ORDINARY, twice.reweight(jnp.full(1, -np.log(2).astype(np.float32))))
     )
     np.testing.assert_array_equal(found, np.concatenate([labels, labels]))
 

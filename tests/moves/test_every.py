@@ -100,7 +100,7 @@ def test_a_move_that_holds_moves_forwards_all_that_they_are():
 @pytest.mark.exactness
 def test_a_resampling_from_time_to_time_leaves_the_choice_of_x_0_alone():
     moves = [Every(1, [mpfjax.Resample()]), Propagate()]
-    filter = mpfjax.with_selected_start(mpfjax.Filter(MODEL, moves, 64), 4)
+    filter = mpfjax.with_initial_selection(mpfjax.Filter(MODEL, moves, 64), 4)
     run = mpfjax.run_filter(KEYS[0], filter, OBSERVATIONS)
     assert not run.resampled[0]
     assert run.resampled[1]

@@ -80,7 +80,7 @@ def test_moments_are_the_kalman_filters(max_components, importance):
 
     def collect(mixture):
         centred = mixture.particles - mixture.mean()[None]
-        return mixture.mean(), mixture.average(centred[:, :, None] * centred[:, None])
+        return mixture.mean(), mixture.expectation(centred[:, :, None] * centred[:, None])
 
     keys = jax.random.split(jax.random.key(0), 100)
     run = mpfjax.monte_carlo(keys, filter, observations, collect)

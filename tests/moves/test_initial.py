@@ -9,7 +9,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.initial import SelectInitial, trusted
+from mpfjax.moves.initial import SelectInitial, selection_weights
 from mpfjax.smoothing import conditional_filter
 from tests.moves.start.test_sampler import PLACES, WithKeys
 from tests.unbiased import assert_unbiased, ratios_to
@@ -30,7 +30,7 @@ def exact():
 
 def make(num_draws, num_particles=100, **options):
     plain = mpfjax.particle_filter(WIDE, num_particles, **options)
-    return mpfjax.with_selected_start(plain, num_draws)
+    return mpfjax.with_initial_selection(plain, num_draws)
 
 
 def nothing(mixture):
@@ -73,7 +73,7 @@ def test_particles_descend_from_those_of_the_run():
     model = mpfjax.LinearGaussianModel(
         np.eye(2), 1e-12 * np.eye(2), np.eye(2), np.eye(2), np.zeros(2), np.eye(2)
     )
-    filter = mpfjax.with_point_sets(mpfjax.mixture_particle_filter(model, 40, 3))
+    filter = mpfjax.with_quasi_monte_carlo(mpfjax.mixture_particle_filter(model, 40, 3))
     run = mpfjax.run_filter(KEY, filter, np.ones((2, 2), np.float32))
     first = jax.tree.map(lambda leaf: leaf[0], run.collected)
     assert len(np.unique(first.ancestor_indices)) == 40  # no particle of x_0 is resampled
@@ -98,7 +98,7 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
 
     def tilt(key, mixture, now):
         log_factors = jax.scipy.stats.norm.logpdf(now.observation, mixture.particles, 2.0)
-        return mixture.weighed(log_factors)
+        return mixture.reweight(log_factors)
 
     model, observation = ScalarLinear(a=1.0, q=0.3, r=0.3, m=0.0, p=3.0), 1.5
     filter = mpfjax.Filter(
@@ -137,19 +137,21 @@ def test_where_x_0_must_be_a_plain_draw_it_is_one():
 def test_impossible_and_empty_particles():
     """How far likelihoods are trusted otherwise is in `tests/lookahead/test_pilot.py`."""
     log_factors = jnp.array([[0.0, -jnp.inf, jnp.nan, 5.0], [0.0, -jnp.inf, 0.0, 5.0]])
-    found = np.asarray(trusted(log_factors, jnp.array([1.0, 1.0, 1.0, 0.0])))
+    found = np.asarray(selection_weights(log_factors, jnp.array([1.0, 1.0, 1.0, 0.0])))
     assert np.all(np.isfinite(found))
     assert found[0] > 1 > found[1] >= 0.25
-    np.testing.assert_array_equal(trusted(jnp.full((2, 3), -jnp.inf), jnp.ones(3)), 1.0)
+    np.testing.assert_array_equal(selection_weights(jnp.full((2, 3), -jnp.inf), jnp.ones(3)), 1.0)
 
 
 @pytest.mark.exactness
 def test_a_prior_too_wide_for_its_draws_is_told(recwarn):
     """Of 800 draws on a plane hardly one is near y_1; on a line some ten are."""
     wide = mpfjax.mixture_particle_filter(WithKeys(), 200, 2)
-    with pytest.warns(RuntimeWarning, match=r"hardly any draw of x_0.*with_start.*log_initial"):
+    with pytest.warns(
+        RuntimeWarning, match=r"hardly any draw of x_0.*with_initialisation.*log_initial"
+    ):
         mpfjax.monte_carlo(jax.random.split(KEY, 4), wide, PLACES[:1], nothing)
     recwarn.clear()
-    mpfjax.run_filter(KEY, mpfjax.with_start(wide, 1), PLACES[:1], nothing)
+    mpfjax.run_filter(KEY, mpfjax.with_initialisation(wide, 1), PLACES[:1], nothing)
     mpfjax.run_filter(KEY, mpfjax.mixture_particle_filter(WIDE, 200, 2), OBSERVATIONS, nothing)
     assert not recwarn.list

@@ -50,11 +50,11 @@ OF_FOUR = scipy.stats.multivariate_normal.logpdf(FOUR[:, 0], np.zeros(4), SHARED
 
 def variance(mixture):
     states = mixture.particles[:, 0]
-    return mixture.average((states - mixture.average(states)) ** 2)
+    return mixture.expectation((states - mixture.expectation(states)) ** 2)
 
 
 def below(mixture):
-    return mixture.average(mixture.particles < 0)
+    return mixture.expectation(mixture.particles < 0)
 
 
 def pf():

@@ -305,7 +305,7 @@ def test_modes_that_share_a_label_keep_their_mass():
     filter = mpfjax.mixture_particle_filter(FourAlike(), 200, 2)
 
     def masses(mixture):
-        return [mixture.average(jnp.abs(mixture.particles - mode) < 10) for mode in MODES]
+        return [mixture.expectation(jnp.abs(mixture.particles - mode) < 10) for mode in MODES]
 
     observations = jnp.array([0.5, -0.5, 0.3, 0.0])
     runs = mpfjax.monte_carlo(jax.random.split(KEY, 600), filter, observations, masses)

@@ -8,7 +8,7 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 import mpfjax
-from mpfjax import keep_programs
+from mpfjax import enable_compilation_cache
 from mpfjax.filter import Filter
 
 SETTINGS = [
@@ -34,7 +34,7 @@ def test_a_program_is_found_again_after_all_are_forgotten(settings, tmp_path):
     jax.monitoring.register_event_listener(
         lambda event, **_: hits.append(event) if event.endswith("cache_hits") else None
     )
-    assert keep_programs(tmp_path / "kept" / "here") == tmp_path / "kept" / "here"
+    assert enable_compilation_cache(tmp_path / "kept" / "here") == tmp_path / "kept" / "here"
     for is_kept in (False, True):
         jax.clear_caches()
         hits.clear()
@@ -45,27 +45,27 @@ def test_a_program_is_found_again_after_all_are_forgotten(settings, tmp_path):
 def test_the_folder_is_the_users_own_unless_jax_has_one(settings, tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path / "of jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 7.0)
-    assert keep_programs() == tmp_path / "of jax"
+    assert enable_compilation_cache() == tmp_path / "of jax"
     assert getattr(jax.config, SETTINGS[1]) == 0.0  # every program is kept
     jax.config.update("jax_compilation_cache_dir", None)
-    assert keep_programs() == tmp_path / "caches" / "mpfjax"
+    assert enable_compilation_cache() == tmp_path / "caches" / "mpfjax"
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
-        keep_programs(tmp_path / "file" / "folder")
+        enable_compilation_cache(tmp_path / "file" / "folder")
     assert getattr(jax.config, SETTINGS[0]) == str(tmp_path / "caches" / "mpfjax")
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize("transformed", [eqx.Partial, eqx.filter_jit])
-def test_a_step_says_what_it_saw_and_its_program_calls_nothing_back(transformed):
+@pytest.mark.parametrize("transform", [eqx.Partial, eqx.filter_jit])
+def test_a_step_says_what_it_saw_and_its_program_calls_nothing_back(transform):
     """No program with a call back into Python is kept for the next process."""
     filter = mpfjax.particle_filter(mpfjax.QuadraticModel(), 8)
     key, mixture = jax.random.key(0), filter.init(jax.random.key(0))
     program = eqx.filter_jit(Filter._step).lower(filter, key, mixture, jnp.ones(()))
     assert "callback" not in program.as_text()
-    step = transformed(lambda observation: filter.step(key, mixture, observation))
+    step = transform(lambda observation: filter.step(key, mixture, observation))
     assert step(jnp.ones(()))[0].num_particles == 8
-    if transformed is eqx.Partial:
+    if transform is eqx.Partial:
         with pytest.raises(ValueError, match="observation: NaN or infinite"):
             step(jnp.full((), jnp.nan))
     else:

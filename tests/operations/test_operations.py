@@ -17,7 +17,7 @@ from mpfjax.operations.matrices import (
     log_total,
     row_sums,
     solve_lower,
-    transformed,
+    transform,
 )
 from mpfjax.operations.prefix_sums import (
     count_starts,
@@ -72,7 +72,7 @@ def indices(values):
 # Prefix sums and places.
 
 
-@pytest.mark.parametrize("how", ["_blocked_sum_before", "_scanned_sum_before"])
+@pytest.mark.parametrize("how", ["_blocked_sum_before", "_sum_before_by_scan"])
 @pytest.mark.parametrize("n", SIZES)
 def test_sums_before_never_fall_and_zeros_add_nothing(n, how):
     # Zeros in runs, some over whole blocks, at the front and at the end; sizes far apart.
@@ -348,7 +348,7 @@ def test_points_by_their_coordinates(d):
     matrix = np.tril(RNG.normal(size=(d, d))).astype(np.float32)
     found = coordinates(jnp.asarray(points))
     for is_lower in (False, True):
-        moved = transformed(jnp.asarray(matrix), found, is_lower)
+        moved = transform(jnp.asarray(matrix), found, is_lower)
         close(jnp.stack(moved, 1), points @ matrix.T, 1e-4)
     close(inner(found, found), np.sum(points**2, axis=1))
     close(row_sums(jnp.asarray(points)), points.sum(axis=1))

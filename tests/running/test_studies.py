@@ -90,12 +90,12 @@ class TestResults:
         def one(sizes, num_cells=1):
             return small_study(num_cells, filters={"pf": tricky}, num_particles=sizes)
 
-        run_study(one([5]), tmp_path / "one", slots=9)
+        run_study(one([5]), tmp_path / "one", num_slots=9)
         with nothing_traced():
-            run_study(one([4, 7, 9], 2), tmp_path / "two", slots=9)
+            run_study(one([4, 7, 9], 2), tmp_path / "two", num_slots=9)
         with pytest.raises(AssertionError, match="traced > 0 times"), nothing_traced():
-            run_study(one([4, 11]), tmp_path / "three", slots=9)  # eleven do not fit
-        results = run_study(one([4, 11]), tmp_path / "three", slots=9, resume=True)
+            run_study(one([4, 11]), tmp_path / "three", num_slots=9)  # eleven do not fit
+        results = run_study(one([4, 11]), tmp_path / "three", num_slots=9, resume=True)
         for cell, same in zip(results, run_study(one([4, 11]), tmp_path / "four"), strict=True):
             np.testing.assert_allclose(cell["evidence"], same["evidence"], rtol=1e-4)
 

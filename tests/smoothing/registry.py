@@ -49,14 +49,14 @@ def _of_paths(model, paths, weights):
     return jnp.sum(weights[:, None, None] * each, axis=0)
 
 
-def _genealogy(key, model, run, inputs=None):
-    return _of_paths(model, trace_ancestors(run).trajectories, run.final.weights)
+def _genealogy(key, filter, run, inputs=None):
+    return _of_paths(filter.model, trace_ancestors(run).trajectories, run.final.weights)
 
 
 def _backward(**options):
-    def smooth(key, model, run, inputs=None):
-        paths = sample_trajectories(key, model, run, NUM_TRAJECTORIES, inputs=inputs, **options)
-        return _of_paths(model, paths, jnp.full(NUM_TRAJECTORIES, 1 / NUM_TRAJECTORIES))
+    def smooth(key, filter, run, inputs=None):
+        paths = sample_trajectories(key, filter, run, NUM_TRAJECTORIES, inputs=inputs, **options)
+        return _of_paths(filter.model, paths, jnp.full(NUM_TRAJECTORIES, 1 / NUM_TRAJECTORIES))
 
     return smooth
 
@@ -93,7 +93,7 @@ def _conditional(key, filter, observations, trajectory, inputs=None):
 class Smoother(NamedTuple):
     """A smoother in one of three forms, and what its rows are estimates of.
 
-    - `of_run`: (key, model, run, inputs) -> (t, s).
+    - `of_run`: (key, filter, run, inputs) -> (t, s).
     - `online`: (key, filter, observations, inputs) -> the increments of log Ẑ, and (t, s).
     - `kernel`: (key, filter, observations, trajectory, inputs) -> (t, s), of another trajectory
       with the law of the given one.

@@ -9,7 +9,7 @@ from mpfjax.smoothing.variance import batch_estimate
 
 
 def above(mixture):
-    return mixture.average(mixture.particles > 0)
+    return mixture.expectation(mixture.particles > 0)
 
 
 @pytest.mark.weekly

@@ -73,7 +73,7 @@ def estimates(program, chain, name):
             series = mpfjax.Series.skipping(observations, inputs)
             run = mpfjax.run_filter(key_run, filter, series)
             rows = {
-                other: each.of_run(own_key, filter.model, run, inputs)
+                other: each.of_run(own_key, filter, run, inputs)
                 for own_key, (other, each) in zip(keys, SMOOTHERS.items(), strict=True)
                 if each.of_run
             }
@@ -138,7 +138,7 @@ def test_rows_are_finite(name, odd):
     if name == "of a run":
         run = mpfjax.run_filter(jax.random.key(1), filter, observations, missing="skip")
         key = jax.random.key(2)
-        rows = [each.of_run(key, model, run) for each in SMOOTHERS.values() if each.of_run]
+        rows = [each.of_run(key, filter, run) for each in SMOOTHERS.values() if each.of_run]
         increments = run.log_likelihood_increments
     else:
         increments, rows = SMOOTHERS[name].online(jax.random.key(1), filter, observations)

@@ -34,9 +34,10 @@ class Odometer(mpfjax.AbstractStateSpaceModel):
 
 
 def test_a_delta_is_warned_of_with_the_share_of_distinct_trajectories():
-    run = mpfjax.run_filter(jax.random.key(0), mpfjax.particle_filter(Odometer(), 200), STEPS)
+    filter = mpfjax.particle_filter(Odometer(), 200)
+    run = mpfjax.run_filter(jax.random.key(0), filter, STEPS)
     with pytest.warns(RuntimeWarning, match="backward weights degenerate") as caught:
-        paths = sample_trajectories(jax.random.key(1), Odometer(), run, 200)
+        paths = sample_trajectories(jax.random.key(1), filter, run, 200)
     num_distinct = len(np.unique(paths["now"][:, 0]))
     assert caught[0].filename == __file__
     assert num_distinct < 20
@@ -64,7 +65,8 @@ class Known(mpfjax.AbstractStateSpaceModel):
 @pytest.mark.parametrize("options", [{}, {"method": "mcmc", "num_moves": 20}])
 def test_few_states_that_have_many_pasts_are_no_reason(options):
     observations = np.cumsum(np.random.default_rng(1).normal(size=20)).astype(np.float32)
-    run = mpfjax.run_filter(jax.random.key(0), mpfjax.particle_filter(Known(), 300), observations)
+    filter = mpfjax.particle_filter(Known(), 300)
+    run = mpfjax.run_filter(jax.random.key(0), filter, observations)
     with warnings.catch_warnings(action="error", category=RuntimeWarning):
-        paths = sample_trajectories(jax.random.key(1), Known(), run, 1000, **options)
+        paths = sample_trajectories(jax.random.key(1), filter, run, 1000, **options)
     assert min(len(np.unique(column)) for column in np.asarray(paths).T[1:]) < 20

@@ -31,7 +31,7 @@ def test_moments_are_the_kalman_filters_and_components_keep_their_masses():
 
         def moments(mixture, observations):
             x, y = mixture.particles[:, 0], observations[:, 0]
-            return [mixture.average(value) for value in (x, x**2, y, y**2)]
+            return [mixture.expectation(value) for value in (x, x**2, y, y**2)]
 
         found = jax.vmap(moments)(ahead.mixtures, ahead.observations)
         masses = jax.vmap(lambda mixture: mixture.log_mass)(ahead.mixtures)

@@ -26,9 +26,7 @@ def smoothed(filter, observations):
     def one(key):
         run = mpfjax.run_filter(key, filter, observations, None)
         key = jax.random.fold_in(key, 1)
-        return sample_trajectories(
-            key, filter.model, run, NUM_TRAJECTORIES, observations=observations
-        )
+        return sample_trajectories(key, filter, run, NUM_TRAJECTORIES, observations=observations)
 
     return jax.lax.map(one, jax.random.split(jax.random.key(0), NUM_RUNS))
 

@@ -7,7 +7,7 @@ import pytest
 import mpfjax
 from mpfjax.operations.random import split
 from mpfjax.smoothing import FixedLagSmoother, smoothed_sums
-from mpfjax.smoothing.sums import _advanced
+from mpfjax.smoothing.sums import _advance
 from tests.marking import weekly
 from tests.smoothing.test_trajectories import QUADRATIC, SQUARES
 
@@ -15,7 +15,10 @@ from tests.smoothing.test_trajectories import QUADRATIC, SQUARES
 def test_no_lag_is_filtering_and_counts_are_averaged():
     filter = mpfjax.particle_filter(QUADRATIC, 50, ess_threshold=0.5)
     run = mpfjax.run_filter(
-        jax.random.key(4), filter, SQUARES, lambda mixture: mixture.average(mixture.particles > 1)
+        jax.random.key(4),
+        filter,
+        SQUARES,
+        lambda mixture: mixture.expectation(mixture.particles > 1),
     )
     found = smoothed_sums(
         jax.random.key(4), filter, SQUARES, lambda before, after: after > 1, lag=0
@@ -41,7 +44,7 @@ def test_one_step_at_a_time_is_the_whole_series(method):
     keys = [jax.random.split(own, len(SQUARES)) for own in split(key, 3)[1:]]
     for step_key, draw_key, seen in zip(*keys, SQUARES, strict=True):
         moved, _ = filter.step(step_key, window.mixture, seen)
-        window, estimates = _advanced(smoother, draw_key, window, moved, None)
+        window, estimates = _advance(smoother, draw_key, window, moved, None)
         terms.append(estimates)
         spreads.append(smoother.variances(window))
     np.testing.assert_array_equal(np.isnan(terms[0]["x"]), [True, True, False])

@@ -23,7 +23,7 @@ def test_trajectories_of_one_component_stay_with_its_mode():
     means = np.asarray(found.final.component_means())
     assert np.sign(means).sum() == 0
     for m in range(2):
-        drawn = sample_trajectories(jax.random.key(m), QUADRATIC, found, 50, component=m)
+        drawn = sample_trajectories(jax.random.key(m), filter, found, 50, component=m)
         assert (np.sign(drawn[:, -1]) == np.sign(means[m])).mean() > 0.9
 
 
@@ -31,7 +31,7 @@ def test_trajectories_of_one_component_stay_with_its_mode():
 def test_the_mixtures_alone_give_trajectories_without_x_0():
     filter = mpfjax.particle_filter(QUADRATIC, 50)
     found = mpfjax.run_filter(jax.random.key(1), filter, jnp.asarray(SQUARES))
-    drawn = sample_trajectories(jax.random.key(2), QUADRATIC, found.collected, 7)
+    drawn = sample_trajectories(jax.random.key(2), filter, found.collected, 7)
     assert drawn.shape == (7, len(SQUARES))
     states = np.asarray(found.collected.particles)
     for t in range(len(SQUARES)):
@@ -103,7 +103,7 @@ def test_what_follows_ancestors_refuses_particles_without_one_parent():
     key, total = jax.random.key(1), lambda before, states: states
     for follow, named in (
         (lambda run: trace_ancestors(run), "trace_ancestors follows"),
-        (lambda run: sample_trajectories(key, QUADRATIC, run, 9, method="mcmc"), "method 'mcmc'"),
+        (lambda run: sample_trajectories(key, filter, run, 9, method="mcmc"), "method 'mcmc'"),
     ):
         with pytest.raises(ValueError, match=f"mixtures: .*{named}"):
             follow(run)
@@ -120,7 +120,7 @@ def test_objects_that_come_from_particles_of_their_own_are_smoothed_right():
     """Backward sampling by all weights, against each object's Kalman smoother."""
     filter = mpfjax.independent_particle_filters(OBJECTS, 500)
     run = mpfjax.run_filter(jax.random.key(0), filter, SEEN)
-    drawn = sample_trajectories(jax.random.key(1), OBJECTS, run, 2000)
+    drawn = sample_trajectories(jax.random.key(1), filter, run, 2000)
     for j in range(2):
         exact = kalman_smoother(OBJECTS.object_model, SEEN[:, j]).means[:, 0]
         np.testing.assert_allclose(drawn[:, :, j, 0].mean(axis=0), exact, atol=0.15)
@@ -141,5 +141,6 @@ def test_a_step_that_no_particle_can_have_taken_is_an_error(method):
     far = run.collected.particles + 1e4
     apart = [run.collected, eqx.tree_at(lambda found: found.particles, run.collected, far)]
     mixtures = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *apart)
+    filter = mpfjax.particle_filter(Bounded(), 30)
     with pytest.raises(RuntimeError, match="log_transition is -inf"):
-        sample_trajectories(jax.random.key(0), Bounded(), mixtures, 3, method=method)
+        sample_trajectories(jax.random.key(0), filter, mixtures, 3, method=method)

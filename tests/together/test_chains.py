@@ -69,7 +69,7 @@ def joint_truth(chain, model):
 
 def moments(mixture):
     states = mixture.particles.reshape(mixture.num_particles, -1)
-    return mixture.average(states), mixture.average(states**2), mixture.particles
+    return mixture.expectation(states), mixture.expectation(states**2), mixture.particles
 
 
 @cache
@@ -103,7 +103,7 @@ EXACT = [
 def runs(chain, model="quadratic", slots=None):
     keys = jax.random.split(jax.random.key(3), NUM_RUNS)
     filter = chain_filter(chain, model)
-    run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, moments, slots=slots)
+    run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, moments, num_slots=slots)
     return jax.tree.map(np.asarray, run)
 
 

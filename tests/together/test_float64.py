@@ -70,7 +70,7 @@ def test_every_smoother_is_traced(name, model):
     def rows(key):
         if smoother.of_run:
             run = mpfjax.run_filter(key, filter, seen, missing="skip")
-            return smoother.of_run(key, filter.model, run)
+            return smoother.of_run(key, filter, run)
         if smoother.online:
             return smoother.online(key, filter, seen)
         return smoother.kernel(key, filter, seen, trajectory)

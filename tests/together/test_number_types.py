@@ -107,7 +107,7 @@ TAKEN = {
     "crps": (lambda x: metrics.crps(x[1:], jnp.ones(2), x[0]), [5, 2, 4]),
     "ospa": (lambda x: metrics.ospa(x, OTHERS, cutoff=3.0), [[1, 6], [0, 3]]),
     "gospa": (lambda x: metrics.gospa(OTHERS, x, cutoff=3.0), [[1, 6], [0, 3]]),
-    "average": (MIXTURE.average, [0, 100, 200, 255]),
+    "expectation": (MIXTURE.expectation, [0, 100, 200, 255]),
     "component_sums": (MIXTURE.component_sums, [0, 100, 200, 255]),
     "Detections": (
         lambda x: np.asarray(Detections.of(x, "boxes").boxes),

@@ -96,9 +96,9 @@ GOOD = {
             mpfjax.Partitioned, mpfjax.RandomPartition, PropagateIndependently,
             PropagateInClusters),
     **alike({"particles_per_component": 2}, Resample, mpfjax.GaussianRegeneration),
-    **alike({"filter": FILTER}, mpfjax.with_lookahead, mpfjax.with_point_sets,
-            mpfjax.with_score_gradient, mpfjax.with_start, mpfjax.with_restarts),
-    **alike({"filter": FILTER, "num_draws": 2}, mpfjax.with_selected_start,
+    **alike({"filter": FILTER}, mpfjax.with_lookahead, mpfjax.with_quasi_monte_carlo,
+            mpfjax.with_score_gradient, mpfjax.with_initialisation, mpfjax.with_restarts),
+    **alike({"filter": FILTER, "num_draws": 2}, mpfjax.with_initial_selection,
             mpfjax.with_proposals_per_particle),
     mpfjax.with_alarm: {"filter": FILTER, "num_particles": 2},
     **alike({"model": MODEL, "num_particles": 4}, mpfjax.particle_filter,
@@ -233,8 +233,8 @@ def test_every_public_call_is_tried():
     assert others == {
         "FilterRun", "Step", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
-        "NetworkProposal", "keep_programs", "check_model", "simulate", "map_moves",
-        "Targets", "targets", "track_table", "number_distribution",
+        "NetworkProposal", "enable_compilation_cache", "check_model", "simulate", "map_moves",
+        "TargetEstimates", "estimate_targets", "track_table", "number_distribution",
     }  # fmt: skip
 
 
@@ -316,7 +316,8 @@ def tracked(detections, frames=(FRAME, FRAME), **options):
 
 
 def paths(run=HISTORY, model=MODEL, **options):
-    return smoothing.sample_trajectories(KEY, model, run, 2, **options)
+    filter = mpfjax.particle_filter(model, 4)
+    return smoothing.sample_trajectories(KEY, filter, run, 2, **options)
 
 
 def around(filter=FILTER, trajectory=THREE):
@@ -358,8 +359,8 @@ REFUSED = (
     ("group: it returned", lambda: mpfjax.GroupBy(lambda x: jnp.zeros(2, int))(KEY, MIXTURE)),
     ("importance: .* draws from no proposal", lambda: mpfjax.gaussian_particle_filter(
         MODEL, 5, importance="predictive_gaussian", proposal=GUIDE)),
-    ("slots: 3 is no whole number of at least N, 4",
-     lambda: mpfjax.monte_carlo(KEY[None], FILTER, TWO, slots=3)),
+    ("num_slots: 3 is not at least N, 4",
+     lambda: mpfjax.monte_carlo(KEY[None], FILTER, TWO, num_slots=3)),
     # observations
     (r"observations: shapes .* jnp.asarray\(observations\)", lambda: run(FILTER, [0.0, 1.0])),
     ("observations: NaN or infinite at index 1", lambda: run(FILTER, np.array([0.0, NAN, 1.0]))),
@@ -479,7 +480,7 @@ REFUSED = (
     *(
         (f"filter: .*{words}", lambda filter=filter: around(filter))
         for words, filter in (
-            ("needs noise='independent'", mpfjax.with_point_sets(FILTER)),
+            ("needs noise='independent'", mpfjax.with_quasi_monte_carlo(FILTER)),
             ("one Propagate or Predict", Filter(MODEL, [Reweight()], 4)),
             ("PropagateNested cannot keep", mpfjax.with_proposals_per_particle(FILTER, 2)),
             ("Partitioned cannot keep", mpfjax.partitioned_sampling(JOINT, 4)),

@@ -78,7 +78,7 @@ def test_outside_the_frame_nothing_is_learned_and_the_object_is_hidden():
     inner = colour_model()
     model = learned_model(hidden_distance=0.1)
     states, frame = states_of(inner, xs=(-500.0, np.nan, 10.0)), jnp.asarray(NOW)
-    learned = model.learned(frame, states, 1.0)
+    learned = model.learn(frame, states, 1.0)
     np.testing.assert_array_equal(learned.appearance[:2], states.appearance[:2])
     assert not np.allclose(learned.appearance[2], states.appearance[2])
     hidden = -0.5 * 0.1 / 0.5**2

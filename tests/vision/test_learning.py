@@ -23,11 +23,11 @@ def test_a_box_is_filtered_as_by_the_kalman_filter():
     rng = np.random.default_rng(0)
     seen = np.array([30.0, 60, 3, 3.5]) + rng.normal(0, 0.05, (6, 4)) * [1, 1, 0, 0]
     error, place, velocity = 0.3, 0.02, 0.005
-    now = Gaussian.begun(seen[:1], np.full((1, 4), 0.3), np.full((1, 4), 0.1))
+    now = Gaussian.initial(seen[:1], np.full((1, 4), 0.3), np.full((1, 4), 0.1))
     unit, got = now.unit[0], []
     for row in seen[1:]:
-        predicted = now.predicted(np.full((1, 4), place), np.full((1, 4), velocity), unit)
-        now, _, _ = predicted.updated(row[None], np.full((1, 4), error))
+        predicted = now.predict(np.full((1, 4), place), np.full((1, 4), velocity), unit)
+        now, _, _ = predicted.update(row[None], np.full((1, 4), error))
         got.append(np.stack([moment[0] for moment in now]))
     for k in range(2):
         model = mpfjax.LinearGaussianModel(
@@ -48,7 +48,7 @@ def test_a_box_is_filtered_as_by_the_kalman_filter():
 def test_mixed_moments_are_those_of_the_mixture_of_both():
     a = Gaussian(*(np.full((1, 4), x) for x in (1.0, 2.0, 1.0, 0.5, 0.8)))
     b = Gaussian(*(np.full((1, 4), x) for x in (3.0, -1.0, 2.0, 0.1, 0.3)))
-    mixed = [moment[0, 0] for moment in a.mixed_with(b, np.full((1, 1), 0.3))]
+    mixed = [moment[0, 0] for moment in a.mix(b, np.full((1, 1), 0.3))]
     means, shares = np.array([[1.0, 2.0], [3.0, -1.0]]), np.array([0.3, 0.7])
     within = np.array([[[1.0, 0.5], [0.5, 0.8]], [[2.0, 0.1], [0.1, 0.3]]])
     off = means - shares @ means
@@ -116,15 +116,16 @@ def test_each_candidate_is_a_filter_of_its_own_from_the_first_detection_on():
     seen += rng.normal(0, 0.05, seen.shape) * [2, 2, 1, 1]
     speed, nobody = np.array([0.1, 0.05, 0.05, 0.03]), Gaussian.none(4)
     state = NoiseState.initial(25.0)
-    state = state._replace(moments=state.begun(seen[:1], speed))
+    state = state._replace(moments=state.newborns(seen[:1], speed))
     alone = [
-        Gaussian.begun(seen[:1], units(seen[:1]) * r, units(seen[:1]) * speed) for r, _, _ in _GRID
+        Gaussian.initial(seen[:1], units(seen[:1]) * r, units(seen[:1]) * speed)
+        for r, _, _ in _GRID
     ]
     for row in seen[1:]:
-        state = state.predicted(1.0).after(np.zeros(1, int), row[None], np.ones(1, bool), nobody)
+        state = state.predict(1.0).after(np.zeros(1, int), row[None], np.ones(1, bool), nobody)
         for i, (error, place, velocity) in enumerate(_GRID):
-            now = alone[i].predicted(np.full(4, place), np.full(4, velocity), alone[i].unit)
-            alone[i] = now.updated(row[None], now.unit * error)[0]
+            now = alone[i].predict(np.full(4, place), np.full(4, velocity), alone[i].unit)
+            alone[i] = now.update(row[None], now.unit * error)[0]
     expected = np.concatenate([moments.place for moments in alone])
     assert np.ptp(expected[:, 2]) > 0.1
     np.testing.assert_allclose(state.moments.place[0], expected, rtol=1e-12)

@@ -128,7 +128,7 @@ def test_moments_are_carried_by_the_matrix_of_the_similarity():
     a, b, shift = 1.02, 0.3, np.array([4.0, -7.0])
     known = np.asarray(True)
     motion = CameraMotion(np.float32([a, b]), shift.astype(np.float32), known)
-    got = motion.carried(Gaussian(*parts))
+    got = motion.carry(Gaussian(*parts))
     matrix = np.array([[a, -b], [b, a]])
     np.testing.assert_allclose(got.place[:, :2], parts[0][:, :2] @ matrix.T + shift, rtol=1e-5)
     np.testing.assert_allclose(
@@ -141,7 +141,7 @@ def test_moments_are_carried_by_the_matrix_of_the_similarity():
             np.testing.assert_allclose(after[i, :2], np.diag(turned), rtol=1e-5)
         np.testing.assert_array_equal(after[:, 2:], before[:, 2:])
     unknown = motion._replace(known=np.asarray(False))
-    for before, after in zip(parts, unknown.carried(Gaussian(*parts)), strict=True):
+    for before, after in zip(parts, unknown.carry(Gaussian(*parts)), strict=True):
         np.testing.assert_array_equal(after, before)
 
 

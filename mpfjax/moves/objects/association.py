@@ -40,9 +40,9 @@ def associate(
     approximated; that of the marginals follows the last rounds.
     """
     missed, alone = missed + _LEAST, alone + _LEAST
-    settled = without_gradient((pairs, missed, alone))
-    replies = settled_replies(*settled)
-    to_columns, to_rows = _claims(replies, *settled[:2]), replies
+    constants = without_gradient((pairs, missed, alone))
+    replies = iterate_replies(*constants)
+    to_columns, to_rows = _claims(replies, *constants[:2]), replies
     log_total = (
         jnp.sum(jnp.log(missed + jnp.sum(pairs * to_rows, axis=1)))
         + jnp.sum(jnp.log(alone + jnp.sum(to_columns, axis=0)))
@@ -55,20 +55,20 @@ def associate(
     return Association(replies, row_sums, column_sums, log_total)
 
 
-def settled_replies(pairs: Any, missed: Any, alone: Any) -> Any:
+def iterate_replies(pairs: Any, missed: Any, alone: Any) -> Any:
     """The messages from columns to rows, once they settle; of arrays of JAX or of NumPy."""
 
-    def unsettled(carry: tuple) -> Any:
+    def goes_on(carry: tuple) -> Any:
         return (carry[0] < _ROUNDS) & (carry[1] > _SETTLED)
 
     def next_round(carry: tuple) -> tuple:
         number, _, replies = carry
-        changed = _next_replies(replies, pairs, missed, alone)
-        return number + 1, (abs(changed - replies) / changed).max(initial=0.0), changed
+        new = _next_replies(replies, pairs, missed, alone)
+        return number + 1, (abs(new - replies) / new).max(initial=0.0), new
 
     start = (0, pairs.dtype.type(1), 0 * pairs + 1 / alone[None])
-    repeated = jax.lax.while_loop if isinstance(pairs, jax.Array) else _while
-    return repeated(unsettled, next_round, start)[-1]
+    loop = jax.lax.while_loop if isinstance(pairs, jax.Array) else _while
+    return loop(goes_on, next_round, start)[-1]
 
 
 def _while(goes_on: Callable, advanced: Callable, carry: tuple) -> tuple:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
 from mpfjax.checks import Count, check
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
-from mpfjax.models.clutter import filled, measured
+from mpfjax.models.clutter import fill_missing, measurement_mask
 from mpfjax.models.targets import TargetsModel
 from mpfjax.moves.base import AbstractResampling, AbstractWrapper, Step
 from mpfjax.moves.objects.association import associate
@@ -122,16 +122,16 @@ class Associate(AbstractWrapper):
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Weigh by each sensor's measurements in turn, then resample."""
         if mixture.usable_slots is not None or num_islands() > 1:
-            raise ValueError("slots: Associate fills every slot, and is not for islands")
+            raise ValueError("num_slots: Associate fills every slot, and is not for islands")
         model = now.model
         scans = () if now.observation is None else model.scans(now.observation)
         key_new, key_last, *keys = split(key, 2 + len(scans))
-        intensity = self._predicted(key_new, mixture, model)
+        intensity = self._predict(key_new, mixture, model)
         for number, (key_scan, scan) in enumerate(zip(keys, scans, strict=True)):
-            intensity = self._updated(key_scan, intensity, model, scan, number)
-        return self._resampled(key_last, mixture, intensity)
+            intensity = self._update(key_scan, intensity, model, scan, number)
+        return self._resample(key_last, mixture, intensity)
 
-    def _predicted(
+    def _predict(
         self, key: Key[Array, ""], mixture: ParticleMixture, model: TargetsModel
     ) -> _Intensity:
         """The intensity before the scan: of survivors and new objects."""
@@ -144,11 +144,11 @@ class Associate(AbstractWrapper):
         share = jnp.sum(undetected) / jnp.maximum(jnp.sum(undetected[:size]), tiny)
         rate = jnp.broadcast_to(model.birth.rate / size, (size,))
 
-        def joined(old: Array, new: Array) -> Array:
+        def join(old: Array, new: Array) -> Array:
             return jnp.concatenate([old[:size], new.astype(old.dtype), old[size:]])
 
         return _Intensity(
-            jax.tree.map(joined, mixture.particles, model.birth.sample(key, size)),
+            jax.tree.map(join, mixture.particles, model.birth.sample(key, size)),
             jnp.concatenate([share * undetected[:size], rate, (masses - undetected)[size:]]),
             jnp.maximum(components[size:] - 1, 0),
             2 * size,
@@ -156,7 +156,7 @@ class Associate(AbstractWrapper):
             jnp.zeros_like(mixture.log_scale),
         )
 
-    def _updated(
+    def _update(
         self,
         key: Key[Array, ""],
         before: _Intensity,
@@ -172,8 +172,10 @@ class Associate(AbstractWrapper):
         highest = jnp.maximum(jnp.max(log_odds, axis=0), jnp.max(log_born, axis=1))
         units = jax.lax.stop_gradient(jnp.maximum(highest, 0.0))
         likely = (before.masses * detection)[:, None] * exp(log_odds - units[None])
-        own = first // 2  # the others are new ones, which are proposed at the measurements
-        starts = jnp.concatenate([likely[:own].T, exp(log_born - units[:, None])], axis=1)
+        num_survivors = (
+            first // 2
+        )  # the others are new ones, which are proposed at the measurements
+        starts = jnp.concatenate([likely[:num_survivors].T, exp(log_born - units[:, None])], axis=1)
 
         pairs, unseen = before.sums(likely), before.masses * (1 - detection)
         missed = before.sums(unseen) + jnp.maximum(1 - before.sums(before.masses), 0.0)
@@ -181,25 +183,25 @@ class Associate(AbstractWrapper):
         association = associate(pairs, missed, jnp.exp(-units) + totals)
         rows = association.row_sums
         replies = before.of_owners(association.replies / rows[:, None])
-        seen = jnp.sum(likely * replies, axis=1)
-        masses = seen + unseen * before.of_owners(1 / rows, 1)
+        detected_masses = jnp.sum(likely * replies, axis=1)
+        masses = detected_masses + unseen * before.of_owners(1 / rows, 1)
         log_evidence = association.log_total + jnp.sum(units)
         log_evidence -= jnp.sum((before.masses * detection)[:first])
 
         num_rows, size = len(totals), self.particles_per_birth
-        drawn, shares = _redrawn(key_drawn, starts, size)
+        parents, shares = _redrawn(key_drawn, starts, size)
         new_masses = shares / association.column_sums[:, None]
         places = jnp.arange(num_rows, dtype=jnp.int32)[:, None]
-        offsets = len(masses) + places * size - own
-        drawn = jnp.where(drawn < own, drawn, drawn + offsets).reshape(-1)
+        offsets = len(masses) + places * size - num_survivors
+        parents = jnp.where(parents < num_survivors, parents, parents + offsets).reshape(-1)
 
-        def joined(old: Array, born: Array) -> Array:
+        def join(old: Array, born: Array) -> Array:
             every = jnp.concatenate([old, born.reshape(-1, *old.shape[1:])])
-            return jnp.concatenate([old, take(every, drawn)])
+            return jnp.concatenate([old, take(every, parents)])
 
         new_owners = jnp.repeat(before.num_objects + places[:, 0], size)
         return before._replace(
-            states=jax.tree.map(joined, before.states, born),
+            states=jax.tree.map(join, before.states, born),
             masses=jnp.concatenate([masses, new_masses.reshape(-1)]),
             owners=jnp.concatenate([before.owners, new_owners]),
             num_objects=before.num_objects + num_rows,
@@ -213,7 +215,11 @@ class Associate(AbstractWrapper):
 
         Over that of clutter.
         """
-        size, sensor, is_there = self.particles_per_birth, model.sensors[number], measured(scan)
+        size, sensor, is_there = (
+            self.particles_per_birth,
+            model.sensors[number],
+            measurement_mask(scan),
+        )
 
         def propose(key: Key[Array, ""], measurement: PyTree) -> tuple:
             states, log_masses = model.birth.propose(key, measurement, size, number)
@@ -223,10 +229,10 @@ class Associate(AbstractWrapper):
                 log_masses += jnp.log1p(-earlier.detection(states))
             return states, log_masses + jnp.log(model.birth.rate / size)
 
-        states, log_masses = jax.vmap(propose)(split(key, is_there.shape[0]), filled(scan))
+        states, log_masses = jax.vmap(propose)(split(key, is_there.shape[0]), fill_missing(scan))
         return states, jnp.where(is_there[:, None], log_masses, -jnp.inf)
 
-    def _told_apart(
+    def _assign_components(
         self, memory: dict[str, Array], intensity: _Intensity, most: int
     ) -> tuple[Int[Array, " p"], dict[str, Array]]:
         """The component of each particle: the most probable objects have one. And the memory."""
@@ -248,16 +254,16 @@ class Associate(AbstractWrapper):
             "crowded_out": jnp.sum(jnp.where(is_probable, existence[order], 0.0)[most:]),
         }
 
-    def _resampled(
+    def _resample(
         self, key: Key[Array, ""], mixture: ParticleMixture, intensity: _Intensity
     ) -> ParticleMixture:
         """The mixture's slots drawn from all particles, and the memory of the step."""
         size, most = self.undetected_particles, mixture.num_components - 1
         rest = mixture.num_particles - size
-        of_each, memory = self._told_apart(mixture.memory[TARGETS], intensity, most)
+        of_each, memory = self._assign_components(mixture.memory[TARGETS], intensity, most)
         key_first, key_rest = split(key, 2)
         undetected = jnp.where(of_each == 0, intensity.masses, 0.0)
-        (drawn,), (masses,) = _redrawn(key_first, undetected[None], size)
+        (parents,), (masses,) = _redrawn(key_first, undetected[None], size)
         objects = ParticleMixture(
             particles=intensity.states,
             log_weights=log_or_nothing(jnp.where(of_each > 0, intensity.masses, 0.0)),
@@ -268,15 +274,15 @@ class Associate(AbstractWrapper):
         )
         objects = self.resample.resample(key_rest, objects)
 
-        def joined(first: Array, others: Array) -> Array:
+        def join(first: Array, others: Array) -> Array:
             return jnp.concatenate([first, others[:rest]])
 
-        first = jax.tree.map(lambda leaf: take(leaf, drawn), intensity.states)
-        log_masses = joined(log_or_nothing(masses), objects.log_weights)
+        first = jax.tree.map(lambda leaf: take(leaf, parents), intensity.states)
+        log_masses = join(log_or_nothing(masses), objects.log_weights)
         return mixture.replace(
-            particles=jax.tree.map(joined, first, objects.particles),
+            particles=jax.tree.map(join, first, objects.particles),
             log_weights=log_masses - log_or_nothing(memory["number"]),
-            component_indicators=joined(jnp.zeros_like(drawn), objects.component_indicators),
+            component_indicators=join(jnp.zeros_like(parents), objects.component_indicators),
             ancestor_indices=no_ancestors(mixture),
             log_scale=mixture.log_scale + intensity.log_evidence,
             memory=mixture.memory | {TARGETS: memory},
@@ -296,8 +302,8 @@ def _once_each(mixture: ParticleMixture, number: Float[Array, ""]) -> Int[Array,
     pairs &= ~jnp.any(pairs, axis=0)[:, None]  # which does not join another
     pairs &= jnp.cumsum(pairs, axis=1) == 1  # and takes one
     places = jnp.arange(len(pairs), dtype=jnp.int32)
-    chosen = jnp.argmax(pairs, axis=0).astype(jnp.int32)
-    return take(jnp.where(jnp.any(pairs, axis=0), chosen, places), mixture.component_indicators)
+    choice = jnp.argmax(pairs, axis=0).astype(jnp.int32)
+    return take(jnp.where(jnp.any(pairs, axis=0), choice, places), mixture.component_indicators)
 
 
 def _redrawn(
@@ -313,7 +319,7 @@ def _redrawn(
     find = jax.vmap(lambda upto, points: jnp.searchsorted(upto, points, side="right"))
     places = find(upto, points * upto[:, -1:]).astype(jnp.int32)
     places = jnp.minimum(places, masses.shape[1] - 1)
-    chosen = jnp.take_along_axis(masses, places, axis=1)
-    equal = jnp.broadcast_to(upto[:, -1:] / number, chosen.shape)
-    ratios = chosen / jax.lax.stop_gradient(jnp.where(chosen > 0, chosen, 1.0))
+    choice = jnp.take_along_axis(masses, places, axis=1)
+    equal = jnp.broadcast_to(upto[:, -1:] / number, choice.shape)
+    ratios = choice / jax.lax.stop_gradient(jnp.where(choice > 0, choice, 1.0))
     return places, add_gradient(equal, equal * ratios)

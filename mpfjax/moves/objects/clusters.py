@@ -10,11 +10,11 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from mpfjax.mixture import ParticleMixture, no_ancestors
 from mpfjax.models.base import require
 from mpfjax.moves.base import Step, is_missing
-from mpfjax.moves.objects.coupling import coupled, recombined, rotated, scores, together
+from mpfjax.moves.objects.coupling import coupled, recombine, rotate, scores, together
 from mpfjax.moves.objects.independent import (
     AbstractPropagationByObject,
-    drawn_rows,
-    moved_objects,
+    draw_rows,
+    move_objects,
     rows_of_each,
 )
 from mpfjax.moves.propagation.propagate import predict
@@ -115,35 +115,35 @@ class PropagateInClusters(AbstractPropagationByObject):
         keys_objects, keys_rows = keys[:num_objects], keys[num_objects : 2 * num_objects]
         key_inside, key_shift = keys[2 * num_objects :]
         particles, labels = mixture.particles, mixture.memory["clusters"]["labels"]
-        points, log_likelihoods = moved_objects(model, keys_objects, particles, now.observation)
+        points, log_likelihoods = move_objects(model, keys_objects, particles, now.observation)
         common = jax.vmap(finite_max)(log_likelihoods)
         log_likelihoods = log_likelihoods - common[:, None]
         if self._may_be_joint(model):
             labels = lowest_connected(together(labels) | coupled(model, points, labels))
-            particles, log_growth = self._updated(
+            particles, log_growth = self._update(
                 model, (keys_rows, key_inside), particles, points, log_likelihoods, labels
             )
         else:
-            rows, log_growth = self._resampled(keys_rows, labels, log_likelihoods)
+            rows, log_growth = self._resample_rows(keys_rows, labels, log_likelihoods)
             particles = rows_of_each(points, rows)
         # Row i is then a draw of the product of the clusters: any row of one cluster meets any row
         # of another with the same probability.
         keys_shift = take(split(key_shift, num_objects), labels)
         places = jnp.arange(mixture.num_particles, dtype=jnp.int32)
-        particles = rows_of_each(particles, jax.vmap(rotated, (0, None))(keys_shift, places))
+        particles = rows_of_each(particles, jax.vmap(rotate, (0, None))(keys_shift, places))
         moved = mixture.replace(
             particles=particles,
             ancestor_indices=no_ancestors(mixture),
             memory=mixture.memory | {"clusters": {"labels": labels}},
-        ).weighed(log_growth[None], jnp.sum(common)[None])
+        ).reweight(log_growth[None], jnp.sum(common)[None])
 
         def impossible() -> ParticleMixture:
             nothing = jnp.full((1,), -jnp.inf, mixture.log_weights.dtype)
-            return predict(key, model, mixture, "none").weighed(nothing)
+            return predict(key, model, mixture, "none").reweight(nothing)
 
         return jax.lax.cond(log_growth == -jnp.inf, impossible, lambda: moved)
 
-    def _updated(
+    def _update(
         self,
         model: Any,
         keys: tuple,
@@ -159,18 +159,18 @@ class PropagateInClusters(AbstractPropagationByObject):
         alone = jnp.sum(together_with, axis=1) == 1
         log_totals, log_sums = scores(model, particles, points, log_likelihoods, alone)
         log_scores = jnp.sum(jnp.where(together_with[:, :, None], log_sums[None], 0.0), axis=1)
-        rows, log_growth = self._resampled(keys_rows, labels, log_scores)
+        rows, log_growth = self._resample_rows(keys_rows, labels, log_scores)
 
         def cross() -> tuple[PyTree, Float[Array, ""]]:
             log_point_weights = log_likelihoods - log_totals
             tables = rows, log_point_weights, log_sums, together_with
-            chosen, log_weights = recombined(model, key_cross, particles, points, *tables)
+            moved, log_weights = recombine(model, key_cross, particles, points, *tables)
             keys_last = split(key_last, len(labels))
-            last, log_gain = self._resampled(keys_last, labels, log_weights)
+            last, log_gain = self._resample_rows(keys_last, labels, log_weights)
             # Without this, rounding could redraw equal weights.
             unmoved = jnp.arange(last.shape[1], dtype=last.dtype)
             last = jnp.where(alone[:, None], unmoved[None], last)
-            return rows_of_each(chosen, last), log_gain
+            return rows_of_each(moved, last), log_gain
 
         def stay() -> tuple[PyTree, Float[Array, ""]]:
             return rows_of_each(points, rows), jnp.zeros((), default_float())
@@ -178,13 +178,13 @@ class PropagateInClusters(AbstractPropagationByObject):
         particles, log_gain = jax.lax.cond(jnp.all(alone), stay, cross)
         return particles, log_growth + log_gain
 
-    def _resampled(
+    def _resample_rows(
         self,
         keys: Key[Array, " objects"],
         labels: Int[Array, " objects"],
         log_weights: Float[Array, "objects n"],
     ) -> tuple[Int[Array, "objects n"], Float[Array, ""]]:
         """Each object's rows drawn anew, alike in a cluster, and log Π of the mean weights."""
-        rows, log_growths = drawn_rows(take(keys, labels), log_weights)
+        rows, log_growths = draw_rows(take(keys, labels), log_weights)
         is_first = labels == jnp.arange(len(labels), dtype=labels.dtype)
         return rows, jnp.sum(jnp.where(is_first, log_growths, 0.0))

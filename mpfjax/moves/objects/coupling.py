@@ -82,16 +82,16 @@ def scores(
             log_b = table + (log_likelihoods[j] - log_totals)[None]
             return log_totals, jax.vmap(log_sum_exp)(log_b)
 
-        def own() -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        def single() -> tuple[Float[Array, " n"], Float[Array, " n"]]:
             return jnp.zeros_like(log_likelihoods[j]), log_likelihoods[j]
 
-        return carry, jax.lax.cond(alone[j], own, shared)
+        return carry, jax.lax.cond(alone[j], single, shared)
 
     objects = jnp.arange(len(alone), dtype=jnp.int32)
     return jax.lax.scan(score, None, objects)[1]
 
 
-def recombined(
+def recombine(
     model: MultiObjectModel,
     key: Key[Array, ""],
     particles: PyTree,
@@ -105,45 +105,45 @@ def recombined(
     num_objects, num_particles = log_sums.shape
     key_start, key_points = split(key, 2)
     ks = jnp.arange(num_particles, dtype=jnp.int32)
-    starts = rotated(key_start, jnp.arange(num_objects, dtype=jnp.int32))[ks % num_objects]
+    starts = rotate(key_start, jnp.arange(num_objects, dtype=jnp.int32))[ks % num_objects]
     alone = jnp.sum(together, axis=1) == 1
     by_object = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), points)
     strides = _GOLDEN * np.arange(num_particles) % 1
 
     def choose(carry: tuple, inputs: tuple) -> tuple[tuple, None]:
-        chosen, log_weights, has_moved = carry
+        moved, log_weights, has_moved = carry
         key, rank = inputs
         objects = (starts + rank) % num_objects  # whose turn it is in each row
         parent_rows = rows[objects, ks]
         parents = jax.tree.map(lambda leaf: leaf[parent_rows, objects], particles)
-        own = jax.tree.map(lambda leaf: leaf[objects], by_object)
-        log_b = jax.vmap(partial(_log_kernels, model))(objects, parents, own)
+        object_points = jax.tree.map(lambda leaf: leaf[objects], by_object)
+        log_b = jax.vmap(partial(_log_kernels, model))(objects, parents, object_points)
         log_b = log_b + log_point_weights[objects]
         partners = has_moved & together[objects]
-        log_psi = _log_potentials(model, chosen, partners, own)
+        log_psi = _log_potentials(model, moved, partners, object_points)
         log_table = log_b + log_psi
         # One random shift serves all rows, and the quantile of each next row is a golden-ratio step
         # further: each is uniform, and a run of equal rows draws evenly.
         quantiles = (strides.astype(log_table.dtype) + uniform(key, (), log_table.dtype)) % 1
         weights, _ = jax.vmap(scaled_exp)(jax.lax.stop_gradient(log_table))
-        picked, log_gain = draw_columns(quantiles, weights), jax.vmap(log_sum_exp)(log_table)
+        places, log_gain = draw_columns(quantiles, weights), jax.vmap(log_sum_exp)(log_table)
         before = log_sums[objects, parent_rows]
         # A row without weight is drawn only if no row of the cluster has any.
         counts = jnp.any(partners, axis=1) & (before != -jnp.inf)
         log_gain = jnp.where(counts, log_gain - jnp.where(counts, before, 0.0), 0.0)
-        picked = jnp.where(alone[objects], parent_rows, picked)
-        states = jax.tree.map(lambda leaf: leaf[picked, objects], points)
+        places = jnp.where(alone[objects], parent_rows, places)
+        states = jax.tree.map(lambda leaf: leaf[places, objects], points)
         states = model.object_with_history(states, parents, objects)
-        chosen = model.replace_object(chosen, objects, states)
+        moved = model.replace_object(moved, objects, states)
         log_weights += jnp.where(together[objects].T, log_gain[None], 0.0)
         moves = objects[:, None] == jnp.arange(num_objects, dtype=jnp.int32)[None]
-        return (chosen, log_weights, has_moved | moves), None
+        return (moved, log_weights, has_moved | moves), None
 
     has_moved = jnp.zeros((num_particles, num_objects), bool)
     carry = (particles, jnp.zeros_like(log_sums), has_moved)
     inputs = (split(key_points, num_objects), jnp.arange(num_objects, dtype=jnp.int32))
-    (chosen, log_weights, _), _ = jax.lax.scan(choose, carry, inputs)
-    return chosen, log_weights
+    (moved, log_weights, _), _ = jax.lax.scan(choose, carry, inputs)
+    return moved, log_weights
 
 
 def _log_kernels(
@@ -158,7 +158,7 @@ def _log_kernels(
 
 
 def _log_potentials(
-    model: MultiObjectModel, chosen: PyTree, partners: Bool[Array, "n objects"], points: PyTree
+    model: MultiObjectModel, moved: PyTree, partners: Bool[Array, "n objects"], points: PyTree
 ) -> Float[Array, "n n"]:
     """Σ log ψ of the partners in row k with its point l, in line k and column l."""
     interaction, num = model.interaction, len(partners)
@@ -169,13 +169,13 @@ def _log_potentials(
 
     def add(total: Float[Array, "n n"], inputs: tuple) -> tuple[Float[Array, "n n"], None]:
         i, meets = inputs
-        log_psi = of_row(model.object_states(chosen, i), points).astype(total.dtype)
+        log_psi = of_row(model.object_states(moved, i), points).astype(total.dtype)
         return total + jnp.where(meets[:, None], log_psi, 0.0), None
 
     objects = jnp.arange(partners.shape[1], dtype=jnp.int32)
     return jax.lax.scan(add, total, (objects, partners.T))[0]
 
 
-def rotated(key: Key[Array, ""], indices: Int[Array, " k"]) -> Int[Array, " k"]:
+def rotate(key: Key[Array, ""], indices: Int[Array, " k"]) -> Int[Array, " k"]:
     """The numbers 0, ..., k-1 in a circle, starting from a random one."""
     return (indices + jax.random.randint(key, (), 0, len(indices), indices.dtype)) % len(indices)

@@ -62,7 +62,7 @@ class Exclusion(AbstractPropagation, ByFeatures):
             square = jnp.sum((features - groups.means[m][None]) ** 2, axis=1)
             nearness = shares[m].astype(square.dtype) * jnp.exp(-square / (2 * self.radius**2))
             total += jnp.where((objects != owners[m]) & (groups.masses[m] > 0), nearness, 0.0)
-        return mixture.weighed(-self.strength * total)
+        return mixture.reweight(-self.strength * total)
 
     def _objects(
         self, mixture: ParticleMixture

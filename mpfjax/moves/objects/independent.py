@@ -66,41 +66,41 @@ class PropagateIndependently(AbstractPropagationByObject):
         num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects)
-        points, log_likelihoods = moved_objects(
+        points, log_likelihoods = move_objects(
             model, keys[:num_objects], mixture.particles, now.observation
         )
-        rows, log_growths = drawn_rows(keys[num_objects:], log_likelihoods)
+        rows, log_growths = draw_rows(keys[num_objects:], log_likelihoods)
         # An object whose particles all have zero likelihood moves by its dynamics alone.
-        own = jnp.arange(rows.shape[1], dtype=rows.dtype)[None]
-        rows = jnp.where((log_growths > -jnp.inf)[:, None], rows, own)
+        identity = jnp.arange(rows.shape[1], dtype=rows.dtype)[None]
+        rows = jnp.where((log_growths > -jnp.inf)[:, None], rows, identity)
         moved = mixture.replace(
             particles=rows_of_each(points, rows), ancestor_indices=no_ancestors(mixture)
         )
-        return moved.weighed(jnp.sum(log_growths)[None])
+        return moved.reweight(jnp.sum(log_growths)[None])
 
 
-def moved_objects(
+def move_objects(
     model: MultiObjectModel, keys: Key[Array, " objects"], states: PyTree, observation: PyTree
 ) -> tuple[PyTree, Float[Array, "objects n"]]:
     """x_t of every object of every row, and the logarithms of their likelihoods."""
-    seen = model.prepare_observation(observation)
+    observation = model.prepare_observation(observation)
 
     def move(key: Key[Array, ""], states: PyTree, j: Int[Array, ""]) -> tuple:
         points = model.sample_object_transition(key, states, j)
-        return points, model.object_log_likelihood(seen, points, j).astype(default_float())
+        return points, model.object_log_likelihood(observation, points, j).astype(default_float())
 
     objects = jnp.arange(model.num_objects, dtype=jnp.int32)
     return jax.vmap(move, in_axes=(0, 1, 0), out_axes=(1, 0))(keys, states, objects)
 
 
-def drawn_rows(
+def draw_rows(
     keys: Key[Array, " objects"], log_weights: Float[Array, "objects n"]
 ) -> tuple[Int[Array, "objects n"], Float[Array, " objects"]]:
     """The rows that each object is resampled from, and log of its mean weight."""
     resample = Resample()
 
     def draw(key: Key[Array, ""], log_weights: Float[Array, " n"]) -> tuple:
-        cloud = single_component(log_weights).weighed(log_weights)
+        cloud = single_component(log_weights).reweight(log_weights)
         return resample.resample(key, cloud).ancestor_indices, cloud.log_mass
 
     return jax.vmap(draw)(keys, log_weights)

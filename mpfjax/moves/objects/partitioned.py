@@ -96,7 +96,7 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects + 1)
         orders = self._orders(keys[-1], num_objects, mixture.num_components)
-        seen = model.prepare_observation(now.observation)
+        observation = model.prepare_observation(now.observation)
 
         def stage(carry: tuple, inputs: tuple) -> tuple[tuple, None]:
             mixture, broken = carry
@@ -104,7 +104,7 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
             mixture = jax.lax.cond(
                 rank > 0, lambda: self.resample.resample(key_resample, mixture), lambda: mixture
             )
-            mixture, fault = self._advance(model, key_object, mixture, seen, orders, rank)
+            mixture, fault = self._advance(model, key_object, mixture, observation, orders, rank)
             return (mixture, broken | fault), None
 
         ranks = jnp.arange(num_objects, dtype=jnp.int32)
@@ -130,7 +130,7 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
         model: Any,
         key: Key[Array, ""],
         mixture: ParticleMixture,
-        seen: PyTree,
+        observation: PyTree,
         orders: Int[Array, "m objects"],
         rank: Int[Array, ""],
     ) -> tuple[ParticleMixture, Bool[Array, ""]]:
@@ -141,12 +141,12 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
         states = model.sample_object_transition(key, previous, objects)
         if self._stops_draws:
             states = jax.lax.stop_gradient(states)
-        log_factors = model.object_log_likelihood(seen, states, objects)
+        log_factors = model.object_log_likelihood(observation, states, objects)
         log_factors = log_factors.astype(mixture.log_weights.dtype)
         if self._stops_draws:
             log_density = model.object_log_transition(states, previous, objects)
             log_factors = add_gradient(log_factors, log_density.astype(log_factors.dtype))
-        moved = mixture.weighed(log_factors)
+        moved = mixture.reweight(log_factors)
         if (interaction := model.interaction) is not None and model.num_objects > 1:
             ranks = jnp.arange(model.num_objects - 1, dtype=jnp.int32)
             has_moved = ranks < rank
@@ -159,7 +159,7 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
                 return interaction(states, others)
 
             values = jax.vmap(potential, in_axes=1)(partners).astype(log_factors.dtype)
-            moved = moved.weighed(jnp.sum(jnp.where(has_moved[:, None], values, 0.0), axis=0))
+            moved = moved.reweight(jnp.sum(jnp.where(has_moved[:, None], values, 0.0), axis=0))
         moved = moved.replace(particles=model.replace_object(particles, objects, states))
         return moved, jnp.any(~(moved.log_weights < jnp.inf))
 

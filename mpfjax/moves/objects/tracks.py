@@ -16,7 +16,7 @@ from mpfjax.moves.objects.bernoulli import TARGETS
 _LEAST_EXISTENCE = 0.5
 
 
-class Targets(NamedTuple):
+class TargetEstimates(NamedTuple):
     """The objects of one step, an entry for each component that may hold one.
 
     - `labels`: of each object, from 1 on, 0 where there is none.
@@ -40,8 +40,8 @@ class Targets(NamedTuple):
     crowded_out: Float[Array, ""]
 
 
-def targets(mixture: ParticleMixture, q: Sequence[float] = ()) -> Targets:
-    """The objects of a `bernoulli_filter`, for `collect=targets` or one mixture.
+def estimate_targets(mixture: ParticleMixture, q: Sequence[float] = ()) -> TargetEstimates:
+    """The objects of a `bernoulli_filter`, for `collect=estimate_targets` or one mixture.
 
     - `q`: which quantiles to find, such as (0.05, 0.95). They cost a sort for each component.
 
@@ -62,7 +62,7 @@ def targets(mixture: ParticleMixture, q: Sequence[float] = ()) -> Targets:
 
     places = jnp.arange(1, mixture.num_components, dtype=jnp.int32)
     means = jax.tree.map(lambda leaf: leaf[1:], mixture.component_means())
-    return Targets(
+    return TargetEstimates(
         labels=memory["labels"][1:],
         existence=of_each,
         means=means,
@@ -90,10 +90,11 @@ def number_distribution(existence: Float[Array, " m"]) -> Float[Array, " n"]:
 
 
 @checked
-def track_table(run: Targets) -> dict[str, np.ndarray]:
+def track_table(run: TargetEstimates) -> dict[str, np.ndarray]:
     """The tracks of a run as columns: `pandas.DataFrame(track_table(run.collected))`.
 
-    - `run`: what `run_filter(..., collect=targets)` collected, with a leading axis of steps.
+    - `run`: what `run_filter(..., collect=estimate_targets)` collected, with a leading axis of
+      steps.
     A track has a row for each step in which its object exists with a probability of a half or more.
     The columns are `step`, from 1 on, `label`, `existence`, and `mean_k` and `deviation_k` of each
     number of the state. Warns where objects were crowded out, with the first such step.
@@ -107,8 +108,8 @@ def track_table(run: Targets) -> dict[str, np.ndarray]:
     flat = jax.vmap(flatten_states)(run.means)
     means = np.asarray(flat)[steps, places]
     variances = np.diagonal(np.asarray(run.covariances), axis1=2, axis2=3)[steps, places]
-    told: dict[str, np.ndarray] = {"step": steps + 1, "label": labels[steps, places]}
-    told["existence"] = existence[steps, places]
+    columns: dict[str, np.ndarray] = {"step": steps + 1, "label": labels[steps, places]}
+    columns["existence"] = existence[steps, places]
     for k in range(means.shape[1]):
-        told |= {f"mean_{k}": means[:, k], f"deviation_{k}": np.sqrt(variances[:, k])}
-    return told
+        columns |= {f"mean_{k}": means[:, k], f"deviation_{k}": np.sqrt(variances[:, k])}
+    return columns

@@ -52,7 +52,7 @@ class PropagateNested(AbstractPropagationOfEach, AbstractWrapper):
             return self.propagate(key, mixture, now)
         n, k = mixture.num_particles, self.num_draws
         key_draws, key_kept = split(key, 2)
-        repeated = mixture.repeated(k)
+        repeated = mixture.repeat(k)
         repeated = repeated.replace(log_weights=repeated.log_weights - math.log(k))
         families = self.propagate(key_draws, repeated, now)
         shares = uniform(key_kept, (n,), mixture.log_weights.dtype)
@@ -63,8 +63,8 @@ class PropagateNested(AbstractPropagationOfEach, AbstractWrapper):
         upto = jnp.cumsum(jax.lax.stop_gradient(weights), axis=1)
         shares = shares.astype(upto.dtype)
         # The last is left out: rounding must not select a draw past the end.
-        kept = jnp.sum(upto[:, :-1] <= shares[:, None] * upto[:, -1:], axis=1, dtype=jnp.int32)
-        places = jnp.arange(n, dtype=jnp.int32) * k + kept
+        choice = jnp.sum(upto[:, :-1] <= shares[:, None] * upto[:, -1:], axis=1, dtype=jnp.int32)
+        places = jnp.arange(n, dtype=jnp.int32) * k + choice
         return mixture.replace(
             particles=jax.tree.map(lambda leaf: take(leaf, places), families.particles),
             log_weights=largest[:, 0] + jnp.log(jnp.sum(weights, axis=1)),

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
+from mpfjax.checks import Renamed
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_moved, require, require_noise
 from mpfjax.models.law import law_of
@@ -49,15 +50,17 @@ class Draw(AbstractPropagation):
         proposal, previous, law = self.proposal, mixture.particles, now.law
         if proposal is None or is_missing(now):
             mixture = predict(key, now.model, mixture, self.gradient, self.noise)
-            return mixture if is_missing(now) else self.weighed(mixture, now)
-        draws, log_density = _proposed(proposal, key, self.noise, mixture, now)
+            return mixture if is_missing(now) else self.reweight(mixture, now)
+        draws, log_density = _propose(proposal, key, self.noise, mixture, now)
         check_moved(draws, law.part(previous), proposal, "propose")
         if self.gradient == "stop":
             draws, log_density = without_gradient((draws, log_density))
         mixture = mixture.replace(particles=law.complete(draws, previous))
-        return self.weighed(mixture, now, previous, log_density)
+        return self.reweight(mixture, now, previous, log_density)
 
-    def weighed(
+    weighed = Renamed("weighed", "reweight")
+
+    def reweight(
         self,
         mixture: ParticleMixture,
         now: Step,
@@ -71,10 +74,10 @@ class Draw(AbstractPropagation):
         if log_density is not None:
             draws = law.part(mixture.particles)
             log_factors.append(law.log_transition(draws, previous) - log_density)
-        return mixture.replace(particles=states).weighed(*log_factors)
+        return mixture.replace(particles=states).reweight(*log_factors)
 
     def around(self, reference: Any) -> AbstractPropagation:
-        """The same around the trajectory, where noise and proposal allow it."""
+        """The move around the trajectory, where noise and proposal allow it."""
         return reference.propagation(self)
 
 
@@ -137,10 +140,10 @@ class Reweight(AbstractPropagation):
         if is_missing(now):
             return mixture
         states, log_factors = now.law.see(now.observation, mixture.particles)
-        return mixture.replace(particles=states).weighed(*log_factors)
+        return mixture.replace(particles=states).reweight(*log_factors)
 
 
-def _proposed(
+def _propose(
     proposal: Any, key: Key[Array, ""], noise: str, mixture: ParticleMixture, now: Step
 ) -> tuple[PyTree, Float[Array, " n"]]:
     """x_t of every particle, and log q of each."""

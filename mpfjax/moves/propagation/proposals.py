@@ -31,7 +31,7 @@ class _Gaussian(NamedTuple):
     back: Callable[[Array], Array]
 
     def log_density(self, noise: Float[Array, "n d"]) -> Float[Array, " n"]:
-        """That of mean + F z, for the noise z."""
+        """The log density of mean + F z, for the noise z."""
         log_unit = 0.5 * noise.shape[1] * math.log(2 * math.pi)
         return -0.5 * jnp.sum(noise**2, axis=1) - log_unit - self.log_volumes
 
@@ -58,7 +58,7 @@ class _GaussianProposal(AbstractProposal):
     def propose_from_noise(
         self, noise: Float[Array, "n d"], now: Step, previous_states: Float[Array, "n ..."]
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
-        """The same, made of this noise."""
+        """x_t from this noise, and log q of each."""
         law = self._law(now, previous_states)
         states = (law.means + law.forth(noise)).reshape(previous_states.shape)
         return states, law.log_density(noise)
@@ -114,8 +114,8 @@ class NetworkProposal(_GaussianProposal):
 
     def _law(self, now: Step, previous_states: Float[Array, "n ..."]) -> _Gaussian:
         previous = previous_states.reshape(previous_states.shape[0], -1)
-        seen = ravel_pytree(now.observation)[0].astype(previous.dtype)
-        rows = jnp.broadcast_to(seen, (previous.shape[0], seen.shape[0]))
+        observation = ravel_pytree(now.observation)[0].astype(previous.dtype)
+        rows = jnp.broadcast_to(observation, (previous.shape[0], observation.shape[0]))
         outputs = jax.vmap(self.network)(jnp.concatenate([previous, rows], axis=1))
         shifts, log_widths = jnp.split(outputs, 2, axis=1)
         scale = jnp.broadcast_to(self.scale.astype(previous.dtype), previous.shape)

@@ -13,8 +13,8 @@ from mpfjax.models.base import require
 from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel,
     log_predictive,
-    predicted,
-    updated,
+    predict,
+    update,
 )
 from mpfjax.moves.base import AbstractPropagation, AbstractProposal, Step, is_missing
 from mpfjax.moves.regrouping.partitions import GroupBy
@@ -60,7 +60,7 @@ class RegimeProposal(AbstractProposal):
     def propose_from_noise(
         self, noise: Float[Array, "n 1"], now: Step, previous_states: MarginalisedState
     ) -> tuple[PyTree, Float[Array, " n"]]:
-        """The same, made of this noise."""
+        """z_t from this noise, and log q of each."""
         return self._drawn(ndtr(noise[:, 0]), now, previous_states)
 
     def log_normaliser(self, now: Step, previous_states: MarginalisedState) -> Float[Array, " n"]:
@@ -77,9 +77,9 @@ class RegimeProposal(AbstractProposal):
         log_factors = jnp.where(possible[None], log_factors, log_priors)
         log_shares = log_factors - logsumexp(log_factors, axis=0)[None]
         upto = jnp.cumsum(jnp.exp(jax.lax.stop_gradient(log_shares)), axis=0)
-        kept = jnp.sum(upto[:-1] <= shares[None] * upto[-1:], axis=0, dtype=jnp.int32)
-        latent = jax.tree.map(lambda *rows: _row(jnp.stack(rows), kept), *latents)
-        return latent, _row(log_shares, kept)
+        indices = jnp.sum(upto[:-1] <= shares[None] * upto[-1:], axis=0, dtype=jnp.int32)
+        latent = jax.tree.map(lambda *rows: _row(jnp.stack(rows), indices), *latents)
+        return latent, _row(log_shares, indices)
 
 
 class PropagateRegimes(AbstractPropagation):
@@ -124,12 +124,12 @@ class PropagateRegimes(AbstractPropagation):
             family = self._family(mixture, [latent for latent, _ in pairs])
             log_priors = jnp.concatenate([log for _, log in pairs])
             family = family.replace(log_weights=family.log_weights + log_priors)
-            return self._chosen(key, mixture, family, model)
+            return self._select_children(key, mixture, family, model)
         mixture = mixture.with_resampled(mixture.active)
         latents, _, log_factors = children(now, mixture.particles)
-        family = self._family(mixture, latents).weighed(log_factors.reshape(-1))
-        moved = self._chosen(key, mixture, family, model)
-        return moved.replace(particles=updated(model, now.observation, moved.particles)[0])
+        family = self._family(mixture, latents).reweight(log_factors.reshape(-1))
+        moved = self._select_children(key, mixture, family, model)
+        return moved.replace(particles=update(model, now.observation, moved.particles)[0])
 
     def _family(self, mixture: ParticleMixture, latents: list[PyTree]) -> ParticleMixture:
         """All children, those of a regime side by side, with their parents' weights and moments.
@@ -141,7 +141,7 @@ class PropagateRegimes(AbstractPropagation):
         latent = jax.tree.map(lambda *rows: jnp.concatenate(rows), *latents)
         return family.replace(particles=family.particles._replace(latent=latent), memory={})
 
-    def _chosen(
+    def _select_children(
         self, key: Key[Array, ""], mixture: ParticleMixture, family: ParticleMixture, model: Any
     ) -> ParticleMixture:
         """N of the N K children, their moments predicted."""
@@ -156,20 +156,20 @@ class PropagateRegimes(AbstractPropagation):
         least = line.of_places(threshold)
         heavy = (line.weights > 0).astype(line.weights.dtype)
         chances = jnp.where(line.weights >= least, heavy, line.weights / least)
-        chosen = draw_ancestors(
+        ancestors = draw_ancestors(
             key,
             line._replace(weights=chances, totals=targets.astype(chances.dtype)),
             targets,
             "systematic",
             num_slots=mixture.num_particles,
         )
-        slots, places = chosen.slots, chosen.particles
+        slots, places = ancestors.slots, ancestors.particles
         log_weights = take(family.log_weights, places)
         log_least = spread(log_or_nothing(threshold) + line.log_units, slots.components)
         gain = jax.lax.stop_gradient(jnp.maximum(log_least - log_weights, 0.0))
-        kept = family.at(places)
-        return kept.replace(
-            particles=predicted(model, kept.particles.latent, kept.particles),
+        selection = family.at(places)
+        return selection.replace(
+            particles=predict(model, selection.particles.latent, selection.particles),
             log_weights=jnp.where(slots.filled, log_weights + gain, -jnp.inf),
             component_indicators=slots.components,
             memory=mixture.memory,
@@ -203,7 +203,7 @@ def _threshold(line: Line, targets: Int[Array, " m"]) -> Float[Array, " m"]:
     weights = line.weights
     slots = targets.astype(weights.dtype)
 
-    def lowered(previous: Float[Array, " m"]) -> Float[Array, " m"]:
+    def lower(previous: Float[Array, " m"]) -> Float[Array, " m"]:
         is_heavy = weights >= line.of_places(previous)
         left = slots - line.sums(is_heavy.astype(weights.dtype))
         rest = line.sums(jnp.where(is_heavy, 0.0, weights))
@@ -214,7 +214,7 @@ def _threshold(line: Line, targets: Int[Array, " m"]) -> Float[Array, " m"]:
 
     first = line.totals / jnp.maximum(slots, 1.0)
     _, threshold = jax.lax.while_loop(
-        is_falling, lambda pair: (pair[1], lowered(pair[1])), (first, lowered(first))
+        is_falling, lambda pair: (pair[1], lower(pair[1])), (first, lower(first))
     )
     return threshold
 

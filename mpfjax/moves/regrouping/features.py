@@ -92,7 +92,7 @@ def origin(values: Float[Array, "n k"], mixture: ParticleMixture) -> Float[Array
 
 def component_groups(mixture: ParticleMixture, groups: Int[Array, " n"]) -> Int[Array, " m"]:
     """The group of each component, where the particles of each are of one."""
-    return jnp.round(mixture.component_averages(groups)).astype(jnp.int32)
+    return jnp.round(mixture.component_expectations(groups)).astype(jnp.int32)
 
 
 class Groups(eqx.Module):

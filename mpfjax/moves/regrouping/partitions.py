@@ -80,7 +80,7 @@ class GroupBy(AbstractRegrouping):
         """Regroup the particles, also where there is one component: labels are then all zero."""
         if is_missing(now):
             return mixture
-        return self.regrouped(mixture, *self.regroup(key, mixture))
+        return self.with_indicators(mixture, *self.regroup(key, mixture))
 
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The label of every particle."""

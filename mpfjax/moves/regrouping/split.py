@@ -86,7 +86,7 @@ class Split(AbstractRegrouping, ByFeatures):
         particles = _Particles(features, weights, parent, mixture.occupied)
         sample = particles
         if size is not None and mixture.num_particles > size * m:
-            sample = _sampled(particles, size * m, mixture)
+            sample = _subsample(particles, size * m, mixture)
         centres = _two_means(sample, m)
         side, gaps = _nearer(features, centres, parent)
         halves = summarise_about(centres, gaps, weights, parent + m * side)
@@ -113,7 +113,7 @@ class _Particles(NamedTuple):
     occupied: Bool[Array, " s"]
 
 
-def _sampled(particles: _Particles, most: int, mixture: ParticleMixture) -> _Particles:
+def _subsample(particles: _Particles, most: int, mixture: ParticleMixture) -> _Particles:
     """Every k-th of the usable slots, at most `num` of them."""
     room = mixture.num_usable_slots
     stride = -(-room // most)
@@ -145,18 +145,18 @@ def _two_means(sample: _Particles, m: int) -> Float[Array, "g k"]:
 
 
 def free_labels(
-    wanted: Bool[Array, " m"], priority: Float[Array, " m"], active: Bool[Array, " m"]
+    is_candidate: Bool[Array, " m"], priority: Float[Array, " m"], active: Bool[Array, " m"]
 ) -> Int[Array, " m"]:
     """A free label for each component that wants one, by priority; its own where none is left."""
     component = jnp.arange(active.shape[0], dtype=jnp.int32)
     earlier = component[:, None] < component[None]
     ties = (priority[:, None] == priority[None]) & earlier
-    goes_first = wanted[:, None] & ((priority[:, None] > priority[None]) | ties)
+    goes_first = is_candidate[:, None] & ((priority[:, None] > priority[None]) | ties)
     rank = jnp.sum(goes_first, axis=0, dtype=jnp.int32)
     free_rank = jnp.cumsum(~active, dtype=jnp.int32) - 1
     matches = ~active[None] & (rank[:, None] == free_rank[None])
     label = jnp.max(jnp.where(matches, component[None], -1), axis=1)
-    return jnp.where(wanted & (label >= 0), label, component)
+    return jnp.where(is_candidate & (label >= 0), label, component)
 
 
 def _nearer(

@@ -28,7 +28,7 @@ class Slots(NamedTuple):
 
 
 def allocate_slots(
-    kept: Int[Array, " m"],
+    counts: Int[Array, " m"],
     due: Bool[Array, " m"],
     num_slots: int | Int[Array, ""],
     particles_per_component: int | None,
@@ -36,16 +36,16 @@ def allocate_slots(
 ) -> Int[Array, " m"]:
     """How many slots each component gets.
 
-    Components that are not due keep theirs, `kept`. The others share the rest of the slots equally;
-    or, given `demands`, in proportion to these with at least one each; or get
+    Components that are not due keep theirs, `counts`. The others share the rest of the slots
+    equally; or, given `demands`, in proportion to these with at least one each; or get
     `particles_per_component` each.
     """
     if particles_per_component is not None:
         share = jnp.minimum(jnp.asarray(particles_per_component, jnp.int32), num_slots)
-        return jnp.where(due, share, kept)
-    if kept.shape[0] == 1:
-        return jnp.where(due, num_slots, kept)
-    pool = num_slots - jnp.sum(kept, dtype=jnp.int32)
+        return jnp.where(due, share, counts)
+    if counts.shape[0] == 1:
+        return jnp.where(due, num_slots, counts)
+    pool = num_slots - jnp.sum(counts, dtype=jnp.int32)
     sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
     if demands is None:
         # One more for the first ones if it does not divide evenly.
@@ -54,7 +54,7 @@ def allocate_slots(
     else:
         first = jnp.minimum(pool // sharers, 1)
         share = first + _in_proportion(pool - first * sharers, due, demands)
-    return stored(jnp.where(due, share, kept))
+    return stored(jnp.where(due, share, counts))
 
 
 def demands_by_variance(
@@ -108,11 +108,11 @@ def _in_proportion(
     pool: Int[Array, ""], due: Bool[Array, " m"], demands: Float[Array, " m"]
 ) -> Int[Array, " m"]:
     """Integers that sum to `pool`, each within one of its exact part."""
-    asked = jnp.where(due, demands, 0)
-    total = jnp.sum(asked)
-    asked = jnp.where(total > 0, asked, due.astype(asked.dtype))
-    parts = jnp.cumsum(asked) / jnp.maximum(jnp.sum(asked), jnp.finfo(asked.dtype).tiny)
-    ends = jnp.round(parts * pool.astype(asked.dtype)).astype(jnp.int32)
+    shares = jnp.where(due, demands, 0)
+    total = jnp.sum(shares)
+    shares = jnp.where(total > 0, shares, due.astype(shares.dtype))
+    parts = jnp.cumsum(shares) / jnp.maximum(jnp.sum(shares), jnp.finfo(shares.dtype).tiny)
+    ends = jnp.round(parts * pool.astype(shares.dtype)).astype(jnp.int32)
     # Despite rounding all slots are given, and none to a component that is not due.
     still_due = jnp.cumsum(due[::-1], dtype=jnp.int32)[::-1] - due.astype(jnp.int32)
     ends = jnp.where(still_due > 0, jnp.minimum(ends, pool), pool)
@@ -137,4 +137,4 @@ def require_equal_rows(mixture: ParticleMixture, who: str) -> None:
     if mixture.num_components != 1:
         raise ValueError(f"mixture: {mixture.num_components} components, not one")
     if mixture.usable_slots is not None:
-        raise ValueError(f"slots: {who} fills every slot, and cannot leave some of them empty")
+        raise ValueError(f"num_slots: {who} fills every slot, and cannot leave some of them empty")

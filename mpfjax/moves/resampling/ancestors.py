@@ -32,10 +32,10 @@ class Ancestors(NamedTuple):
 
     particles: Int[Array, " n"]
     slots: Slots
-    kept: Int[Array, ""] | None  # the slot of the offspring that was to be kept
+    reference: Int[Array, ""] | None  # the slot of the offspring that was to be kept
 
 
-class Kept(NamedTuple):
+class ReferenceParticle(NamedTuple):
     """A particle that has one offspring at least."""
 
     place: Int[Array, ""]
@@ -51,7 +51,7 @@ class Dealt(NamedTuple):
     slots: Slots
     expected: Float[Array, " p"]  # the expected number of offspring of each particle
     before: Positions  # the start of its interval
-    kept: Kept | None
+    reference: ReferenceParticle | None
 
 
 def draw_ancestors(
@@ -73,15 +73,15 @@ def draw_ancestors(
     shares = targets.astype(line.totals.dtype) / jnp.where(line.totals > 0, line.totals, 1.0)
     expected = line.weights * line.of_places(shares)
     before, is_inside = line.positions(expected, targets, slots.firsts, num_slots)
-    kept = None
+    reference = None
     if keep is not None:
         key, key_kept = split(key, 2)
         place, component = keep, jnp.zeros((), jnp.int32)
         if line.order is not None and line.labels is not None:
             place = jnp.argmax(line.order == keep).astype(jnp.int32)
             component = line.components[place]
-        kept = Kept(place, component, uniform(key_kept, (2,), expected.dtype))
-    starts = SCHEMES[scheme](key, Dealt(line, targets, slots, expected, before, kept))
+        reference = ReferenceParticle(place, component, uniform(key_kept, (2,), expected.dtype))
+    starts = SCHEMES[scheme](key, Dealt(line, targets, slots, expected, before, reference))
     # Rounding must not give a slot to particles after the last weight, nor cross a border.
     num_filled = jnp.sum(targets, dtype=jnp.int32)
     starts = jnp.where(is_inside, jnp.minimum(starts, num_filled), num_filled)
@@ -91,16 +91,16 @@ def draw_ancestors(
     if due is not None:
         parents = jnp.where(spread(due, slots.components), parents, firsts + slots.ranks)
     slot = None
-    if kept is not None:
+    if reference is not None:
         # Rounding may leave it without any: it then takes the slot where its interval starts.
-        is_own = slots.filled & (parents == kept.place)
+        is_own = slots.filled & (parents == reference.place)
         number = jnp.sum(is_own, dtype=jnp.int32)
-        choice = (kept.shares[1] * number.astype(expected.dtype)).astype(jnp.int32)
+        choice = (reference.shares[1] * number.astype(expected.dtype)).astype(jnp.int32)
         slot = jnp.argmax(is_own).astype(jnp.int32) + jnp.minimum(choice, number - 1)
-        slot = jnp.where(number > 0, slot, starts[kept.place])
-        first, most = slots.firsts[kept.component], targets[kept.component]
+        slot = jnp.where(number > 0, slot, starts[reference.place])
+        first, most = slots.firsts[reference.component], targets[reference.component]
         slot = jnp.clip(slot, first, first + jnp.maximum(most, 1) - 1)
-        parents = parents.at[slot].set(kept.place)
+        parents = parents.at[slot].set(reference.place)
     particles = jnp.clip(parents, 0, line.num_particles - 1)
     if line.order is not None:
         particles = take(line.order, stored(particles))
@@ -109,28 +109,28 @@ def draw_ancestors(
 
 def systematic(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
     shift = stored(uniform(key, dealt.targets.shape, dealt.expected.dtype))
-    if dealt.kept is not None:
-        shift = shift.at[dealt.kept.component].set(_own_point(dealt).fraction)
+    if dealt.reference is not None:
+        shift = shift.at[dealt.reference.component].set(_reference_point(dealt).fraction)
     comes_before = dealt.line.of_places(shift) < dealt.before.fraction
     return dealt.before.whole + comes_before.astype(jnp.int32)
 
 
 def stratified(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
     shift = uniform(key, dealt.slots.components.shape, dealt.expected.dtype)
-    if dealt.kept is not None:
-        own = _own_point(dealt)
-        shift = shift.at[own.whole].set(own.fraction, mode="drop")
+    if dealt.reference is not None:
+        point = _reference_point(dealt)
+        shift = shift.at[point.whole].set(point.fraction, mode="drop")
     slot = jnp.clip(dealt.before.whole, 0, shift.shape[0] - 1)
     comes_before = take(shift, slot) < dealt.before.fraction
     return dealt.before.whole + comes_before.astype(jnp.int32)
 
 
-def _own_point(dealt: Dealt) -> Positions:
+def _reference_point(dealt: Dealt) -> Positions:
     """A point drawn uniformly from the interval of the kept particle."""
-    assert dealt.kept is not None
-    before, place = dealt.before, dealt.kept.place
+    assert dealt.reference is not None
+    before, place = dealt.before, dealt.reference.place
     start = Positions(before.whole[place], before.fraction[place])
-    return start.moved_by(dealt.kept.shares[0] * dealt.expected[place])
+    return start.shift(dealt.reference.shares[0] * dealt.expected[place])
 
 
 def multinomial(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
@@ -139,9 +139,9 @@ def multinomial(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
     num_bits = unit_bits(num_slots)
     lengths = jnp.maximum(spread(dealt.targets, slots.components), 1) << num_bits
     points = below(key, lengths) + (spread(slots.firsts, slots.components) << num_bits)
-    if dealt.kept is not None:
-        own = _own_point(dealt).in_units(num_bits)
-        points = points.at[slots.firsts[dealt.kept.component]].set(own, mode="drop")
+    if dealt.reference is not None:
+        point = _reference_point(dealt).in_units(num_bits)
+        points = points.at[slots.firsts[dealt.reference.component]].set(point, mode="drop")
     parents = jnp.searchsorted(dealt.before.in_units(num_bits), points, side="right") - 1
     # The points of empty slots are in no particle's interval.
     places = jnp.where(slots.filled, jnp.maximum(parents, 0).astype(jnp.int32), num_places)

@@ -67,12 +67,12 @@ class AuxiliaryResample(AbstractWrapper):
         log_factors = self._log_factors(mixture, now)
         # Resampling may lose a NaN, or a particle whose look-ahead is infinite.
         broken = jnp.any(mixture.occupied & ~(log_factors < jnp.inf))
-        due = self.resample.due(mixture.weighed(log_factors))
+        due = self.resample.due(mixture.reweight(log_factors))
         log_factors = jnp.where(spread(due, mixture.component_indicators), log_factors, 0.0)
-        drawn, ancestors = self.resample.redraw(key, mixture.weighed(log_factors), due)
-        drawn = drawn.weighed(-take(log_factors, ancestors.particles))
-        drawn = drawn.replace(log_weights=jnp.where(broken, jnp.nan, drawn.log_weights))
-        return unless_waiting(drawn, mixture)
+        result, ancestors = self.resample.redraw(key, mixture.reweight(log_factors), due)
+        result = result.reweight(-take(log_factors, ancestors.particles))
+        result = result.replace(log_weights=jnp.where(broken, jnp.nan, result.log_weights))
+        return unless_waiting(result, mixture)
 
     def _log_factors(self, mixture: ParticleMixture, now: Step) -> Float[Array, " n"]:
         """log ν of each particle, zero in a component where ν is zero throughout."""
@@ -80,7 +80,7 @@ class AuxiliaryResample(AbstractWrapper):
             values = _log_nu(self.lookahead, mixture, now)
         values = real_each(values, mixture.num_particles, "lookahead: it")
         log_factors = values.astype(mixture.log_weights.dtype)
-        has_any = mixture.weighed(log_factors).active
+        has_any = mixture.reweight(log_factors).active
         counts = spread(has_any, mixture.component_indicators) | ~(log_factors < jnp.inf)
         return jnp.where(counts, log_factors, 0.0)
 

@@ -74,10 +74,10 @@ class GaussianRegeneration(AbstractResampling):
         """The mixture with every active component redrawn."""
         key_noise, key_rest = split(key, 2)
         vacated = self._resample.resample(key_rest, mixture)
-        drawn = self._draw(key_noise, self._redrawn(mixture.particles), mixture, vacated)
+        states = self._draw(key_noise, self._redrawn(mixture.particles), mixture, vacated)
         if self.where is not None:
-            drawn = eqx.tree_at(self.where, vacated.particles, drawn)
-        redrawn = vacated.replace(particles=drawn, ancestor_indices=no_ancestors(vacated))
+            states = eqx.tree_at(self.where, vacated.particles, states)
+        redrawn = vacated.replace(particles=states, ancestor_indices=no_ancestors(vacated))
         mixture = redrawn.with_resampled_of(mixture)
         if self.noise != "rqmc":
             return mixture

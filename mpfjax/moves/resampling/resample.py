@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import Count, Share, one_of
-from mpfjax.memory import Offspring, after_resampling, kept_slot
+from mpfjax.memory import Offspring, after_resampling, reference_slot
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractResampling, Gradient, Step
 from mpfjax.moves.resampling.allocation import (
@@ -141,7 +141,7 @@ class Resample(AbstractResampling):
         n, m = mixture.num_particles, mixture.num_components
         all_are_due = self.ess_threshold == 1.0
         stays = None if all_are_due else ~spread(due, mixture.component_indicators)
-        keep = kept_slot(mixture.memory)
+        keep = reference_slot(mixture.memory)
         if keep is not None:
             is_kept = jnp.arange(n, dtype=jnp.int32) == keep
             stays = is_kept if stays is None else stays | is_kept
@@ -173,7 +173,7 @@ class Resample(AbstractResampling):
             )
             .with_order(self.sort_by is not None)
         )
-        offspring = Offspring(parents, targets, due, ancestors.kept)
+        offspring = Offspring(parents, targets, due, ancestors.reference)
         return after_resampling(mixture, redrawn, offspring), ancestors
 
     def deal(
@@ -188,7 +188,7 @@ class Resample(AbstractResampling):
                 line.log_masses, line.effective_sample_sizes, line.counts, due, num_slots
             )
         # If all living components are due, none keeps its particles.
-        kept = jnp.zeros_like(due, jnp.int32)
+        counts = jnp.zeros_like(due, jnp.int32)
         if self.ess_threshold < 1.0:
-            kept = jnp.where(due, 0, line.counts)
-        return allocate_slots(kept, due, num_slots, self.particles_per_component, demands)
+            counts = jnp.where(due, 0, line.counts)
+        return allocate_slots(counts, due, num_slots, self.particles_per_component, demands)

@@ -55,7 +55,7 @@ class Alarm(Memory):
         if not is_missing(now):
             log_evidence = self.log_evidence(now) - increment
         alarm = self.heard(log_evidence)
-        return alarm, {"log_evidence_against_start": log_evidence, "surprised": alarm.rings}
+        return alarm, {"log_evidence_against_start": log_evidence, "alarm": alarm.rings}
 
 
 class WatchStart(AbstractMove):

@@ -62,20 +62,21 @@ class RecentSteps(Memory):
     def check_run(self, num_steps: int) -> None:
         """Raise a `ValueError` for a run that ends before its start."""
         if num_steps < self.start:
-            which = f"fewer than num_observations of with_start, {self.start}"
+            which = f"fewer than num_observations of with_initialisation, {self.start}"
             raise ValueError(f"observations: {num_steps} steps, {which}")
 
     def warning(self) -> str:
         """Where the powers of a likelihood ran out."""
-        said = "the likelihood is too narrow for the sampler of with_start and with_restarts, which"
-        return f"{said} ran out of powers" if np.any(self.is_rushed) else ""
+        sampler = "the sampler of with_initialisation and with_restarts"
+        message = f"the likelihood is too narrow for {sampler}, which ran out of powers"
+        return message if np.any(self.is_rushed) else ""
 
     def with_step(self, now: Step) -> "RecentSteps":
         """The steps with one more, without the oldest; a missing observation is not present."""
         is_present = jnp.asarray(now.is_present)
         data = Window(now.observation, now.inputs, is_present)
         observations, inputs, present = (
-            old if new is None else _pushed(old, new, self.log_increments.shape[0])
+            old if new is None else _push(old, new, self.log_increments.shape[0])
             for old, new in zip(self.window, data, strict=True)
         )
         if not now.is_present:
@@ -112,7 +113,7 @@ class RecentSteps(Memory):
             alarm = Alarm(jnp.where(mixture.t > self.start, alarm.total, 0.0), alarm.num_particles)
             age = jnp.where(self.is_renewed, -1, age)
             age = jnp.where(alarm.total > 0, age + 1, 0).astype(jnp.int32)
-            additions |= {"log_evidence_against_start": against, "surprised": alarm.rings}
+            additions |= {"log_evidence_against_start": against, "alarm": alarm.rings}
         is_early = mixture.t < self.start
         reported = jnp.where(is_early, 0.0, increment)
         is_degenerate = (is_impossible | (reported == -jnp.inf)) & ~is_early
@@ -149,9 +150,9 @@ class Restart(AbstractWrapper):
     - `probability`: p; None never restarts.
     - `num_particles`: draws of x_0 of the alarm.
 
-    `with_start` and `with_restarts` make filters with it. Raises `ValueError` in a filter of a
-    model without a density of x_0 in floating point, of a conditionally linear model, and for fewer
-    slots than components at a restart.
+    `with_initialisation` and `with_restarts` make filters with it. Raises `ValueError` in a filter
+    of a model without a density of x_0 in floating point, of a conditionally linear model, and for
+    fewer slots than components at a restart.
     """
 
     grouping: Moves = eqx.field(converter=lambda moves: as_moves(moves, "grouping"))
@@ -183,7 +184,7 @@ class Restart(AbstractWrapper):
 
     def around(self, reference: Any) -> AbstractMove:
         """Raise a `ValueError`: a trajectory cannot be kept where the state begins anew."""
-        raise ValueError("filter: with_start and with_restarts cannot keep a trajectory")
+        raise ValueError("filter: with_initialisation and with_restarts cannot keep a trajectory")
 
     def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
         """Room for L steps."""
@@ -208,7 +209,7 @@ class Restart(AbstractWrapper):
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """The mixture with the state drawn anew, where it is due."""
         if mixture.usable_slots is not None:
-            raise ValueError("slots: with_start and with_restarts need every slot")
+            raise ValueError("num_slots: with_initialisation and with_restarts need every slot")
         recent = mixture.memory[RECENT].with_step(now)
         mixture = mixture.replace(memory=mixture.memory | {RECENT: recent}).with_order(False)
         is_due = is_start = jnp.asarray(self.at_start) & (mixture.t == self.num_observations)
@@ -219,12 +220,12 @@ class Restart(AbstractWrapper):
             return mixture
 
         def renew() -> ParticleMixture:
-            new = self._renewed(key, mixture, now, is_start)
+            new = self._renew(key, mixture, now, is_start)
             return jax.tree.map(lambda new, old: jnp.where(is_due, new, old), new, mixture)
 
         return cond_if_any(is_due, renew, lambda: mixture)
 
-    def _renewed(
+    def _renew(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step, is_start: Bool[Array, ""]
     ) -> ParticleMixture:
         """The mixture of the particles drawn anew, and at a restart of those that there are."""
@@ -241,25 +242,27 @@ class Restart(AbstractWrapper):
         log_z = jnp.sum(sample.log_increments)
         start = alone.replace(log_scale=log_z - np.log(num_islands()))
         log_increments = sample.log_increments
-        moved, log_known = start, jnp.zeros_like(log_z)
+        moved, log_old_increment = start, jnp.zeros_like(log_z)
         if self.probability is not None:
             assert mixture.within is not None
             growth = jax.lax.stop_gradient(mixture.within.log_increment)
             # The evidence of each step by the old hypotheses, or where it is zero, by the new ones.
-            known = recent.log_increments.at[-1].set(growth)
-            known = jnp.where(known > -jnp.inf, known, finite_or_zero(sample.log_increments))
+            old_increments = recent.log_increments.at[-1].set(growth)
+            old_increments = jnp.where(
+                old_increments > -jnp.inf, old_increments, finite_or_zero(sample.log_increments)
+            )
             is_impossible = jnp.any(recent.is_impossible) | (growth == -jnp.inf)
-            log_odds = jnp.sum(sample.log_increments - known)
-            both = self._joined(key_join, mixture, alone, log_odds, is_impossible)
+            log_odds = jnp.sum(sample.log_increments - old_increments)
+            both = self._join(key_join, mixture, alone, log_odds, is_impossible)
             moved = jax.tree.map(partial(jnp.where, is_start), start, both)
-            log_known = jnp.where(is_start, 0.0, known[-1])
-            log_increments = jnp.where(is_start, sample.log_increments, known)
+            log_old_increment = jnp.where(is_start, 0.0, old_increments[-1])
+            log_increments = jnp.where(is_start, sample.log_increments, old_increments)
         moved, log_growth = moved.normalised(mixture)
         recent = dataclasses.replace(
             recent,
             log_increments=log_increments,
             is_impossible=jnp.zeros_like(recent.is_impossible),
-            log_evidence=log_known + log_growth,
+            log_evidence=log_old_increment + log_growth,
             is_renewed=jnp.ones((), bool),
             is_rushed=recent.is_rushed | sample.is_rushed,
         )
@@ -267,7 +270,7 @@ class Restart(AbstractWrapper):
         # Grouping, as of x_0, waits for no observation.
         return in_turn(key_group, self.grouping, moved, dataclasses.replace(now, is_initial=True))
 
-    def _joined(
+    def _join(
         self,
         key: Key[Array, ""],
         old: ParticleMixture,
@@ -293,9 +296,9 @@ class Restart(AbstractWrapper):
         new = new.at(jnp.minimum((slot - num_old) * n // number, n - 1))
         old = old.at(systematic_sample(key, old.log_weights, num_old))
         log_weights = jnp.where(is_new, log_new - jnp.log(number), log_old - jnp.log(num_old))
-        joined = select_rows(is_new, new.particles, old.particles)
+        particles = select_rows(is_new, new.particles, old.particles)
         return old.with_resampled(old.active).replace(
-            particles=joined,
+            particles=particles,
             log_weights=log_weights.astype(old.log_weights.dtype),
             component_indicators=jnp.where(is_new, 0, old.component_indicators),
             ancestor_indices=jnp.where(is_new, BEGAN_ANEW, old.ancestor_indices),
@@ -322,7 +325,7 @@ def _room(tree: PyTree, length: int) -> PyTree:
     return jax.tree.map(zeros, tree)
 
 
-def _pushed(old: PyTree, new: PyTree, length: int) -> PyTree:
+def _push(old: PyTree, new: PyTree, length: int) -> PyTree:
     """The rows with a new one at the end, without the first."""
     rows = _room(new, length) if old is None else old
     return jax.tree.map(

@@ -136,7 +136,9 @@ def _constant(values: Array) -> Array:
 
 @_constant.defjvp
 def _refuse(primals: Any, tangents: Any) -> Any:
-    raise ValueError("filter: with_start and with_restarts have no derivatives in the model")
+    raise ValueError(
+        "filter: with_initialisation and with_restarts have no derivatives in the model"
+    )
 
 
 def _first_paths(key: Key[Array, ""], model: Any, num_particles: int, num_steps: int) -> _Paths:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
-from mpfjax.checks import Count, NotNegative, Positive, Share, checked, shown
+from mpfjax.checks import Count, NotNegative, Positive, Renamed, Share, checked, shown
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 from mpfjax.operations.random import fast_key
@@ -23,7 +23,7 @@ from mpfjax.vision.colour.histograms import (
     normalise,
     reference_histograms,
 )
-from mpfjax.vision.files.boxes import centred, check_boxes
+from mpfjax.vision.files.boxes import check_boxes, to_centre
 from mpfjax.vision.files.frames import check_frame
 
 Seen = IntegralHistogram | UInt8[Array, "h w 3"]
@@ -206,7 +206,7 @@ class ColourModel(AbstractBoxModel):
         deviations = positive_deviations(
             np.sqrt(PAPER_VARIANCES) if deviations is None else deviations, len(boxes)
         )
-        places = jnp.asarray(centred(boxes), float)
+        places = jnp.asarray(to_centre(boxes), float)
         references, weights = reference_histograms(frame, colours, places, num_parts, weigh_colours)
         if share_reference:
             references = jnp.broadcast_to(references.mean(0, keepdims=True), references.shape)
@@ -231,7 +231,7 @@ class ColourModel(AbstractBoxModel):
     def log_likelihood(self, observation: Seen, states: BoxState) -> Float[Array, " n"]:
         """-(Σ_c B² - contrast Σ_c B²_around) / 2σ², each B² averaged over the bands."""
         counts, sides = self.counts(observation, states)
-        distances = self.distances(counts, sides, *self.own(states))
+        distances = self.distances(counts, sides, *self.references_of(states))
         return -0.5 * distances / self.sigma**2
 
     def prepare_observation(self, observation: Seen) -> IntegralHistogram:
@@ -265,7 +265,9 @@ class ColourModel(AbstractBoxModel):
         around = jnp.where(uncounted, 0.0, _distances(sides, weights, references))
         return distances - self.contrast * around
 
-    def own(self, states: BoxState) -> tuple[Histograms, Histograms]:
+    own = Renamed("own", "references_of")
+
+    def references_of(self, states: BoxState) -> tuple[Histograms, Histograms]:
         """The weights of colours and the references of the particles."""
         weights, references = self.colour_weights, self.references
         # With one reference, a gather costs more than the distance. Under vmap, where

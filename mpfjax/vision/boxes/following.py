@@ -74,12 +74,12 @@ def follow_boxes(
 def _advance_boxes(filter, num_objects, key, t, mixture, counted):
     step_keys = split_once(jax.random.fold_in(key, t), len(filter.moves))
     mixture, info = filter._step(step_keys, mixture, counted)
-    best, held = best_components(mixture, num_objects)
-    means = mixture.component_averages(filter.model.boxes(mixture.particles))
-    identities = jnp.where(held, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)
+    best, exists = best_components(mixture, num_objects)
+    means = mixture.component_expectations(filter.model.boxes(mixture.particles))
+    identities = jnp.where(exists, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)
     unseen = jnp.zeros(num_objects, jnp.int32)
     none, never = jnp.full(num_objects, -1, jnp.int32), jnp.zeros(num_objects)
     full = jnp.zeros((), bool)
-    told = full, held, none, never, unseen, jnp.ones(num_objects)
-    tracks = Tracks(means[best], identities, held, unseen, *told)
+    rest = full, exists, none, never, unseen, jnp.ones(num_objects)
+    tracks = Tracks(means[best], identities, exists, unseen, *rest)
     return mixture, tracks, info.log_likelihood_increment

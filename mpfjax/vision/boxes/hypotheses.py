@@ -44,13 +44,13 @@ class LearnedColourModel(ColourModel):
 
     def log_likelihood(self, observation: Seen, states: BoxState) -> Float[Array, " n"]:
         """log of the sum of the two terms, visible and hidden."""
-        log_seen, log_hidden, _ = self._seen(observation, states)
+        log_seen, log_hidden, _ = self._log_terms(observation, states)
         return jnp.logaddexp(log_seen, log_hidden)
 
-    def learned(self, observation: Seen, states: BoxState, rate: float) -> BoxState:
+    def learn(self, observation: Seen, states: BoxState, rate: float) -> BoxState:
         """The states, after rate · P(seen | x, y) (h(x) - appearance) is added to appearances."""
-        log_seen, log_hidden, counts = self._seen(observation, states)
-        shown = normalise(counts, self.own(states)[0])
+        log_seen, log_hidden, counts = self._log_terms(observation, states)
+        shown = normalise(counts, self.references_of(states)[0])
         # A box that holds no pixel, or more than can be counted, has no colours to learn.
         some = jnp.any(shown > 0, axis=(1, 2, 3)) & jnp.all(jnp.isfinite(shown), axis=(1, 2, 3))
         share = jnp.where(some, rate * jax.nn.sigmoid(log_seen - log_hidden), 0.0)
@@ -59,12 +59,12 @@ class LearnedColourModel(ColourModel):
         change = jnp.where(share > 0, shown, past) - past
         return dataclasses.replace(states, appearance=past + share * change)
 
-    def _seen(
+    def _log_terms(
         self, observation: Seen, states: BoxState
     ) -> tuple[Float[Array, " n"], Float[Array, ""], Histograms]:
         """log of the two terms of the likelihood, and the colours in the boxes."""
         counts, sides = self.counts(observation, states)
-        weights, references = self.own(states)
+        weights, references = self.references_of(states)
         to_first = self.distances(counts, sides, weights, references)
         appearance: Any = states.appearance
         to_learned = self.distances(counts, sides, weights, appearance)
@@ -98,7 +98,7 @@ class AdaptAppearance(AbstractPropagation):
         """Learn from this frame, unless it is missing."""
         if is_missing(now):
             return mixture
-        particles = now.model.learned(now.observation, mixture.particles, self.rate)
+        particles = now.model.learn(now.observation, mixture.particles, self.rate)
         return mixture.replace(particles=particles)
 
 
@@ -106,8 +106,10 @@ def best_components(
     mixture: ParticleMixture, num_objects: int
 ) -> tuple[Int[Array, " k"], Bool[Array, " k"]]:
     """The heaviest component of each object, and whether the object has one at all."""
-    own = component_references(mixture)[None] == jnp.arange(num_objects, dtype=jnp.int32)[:, None]
-    masses = jnp.where(own & mixture.active[None], mixture.log_mixture_weights[None], -jnp.inf)
+    is_own = (
+        component_references(mixture)[None] == jnp.arange(num_objects, dtype=jnp.int32)[:, None]
+    )
+    masses = jnp.where(is_own & mixture.active[None], mixture.log_mixture_weights[None], -jnp.inf)
     return jnp.argmax(masses, axis=1), jnp.max(masses, axis=1) > -jnp.inf
 
 

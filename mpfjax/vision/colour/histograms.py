@@ -174,16 +174,18 @@ def reference_histograms(
 ) -> tuple[Histograms, Histograms]:
     """The normalised histograms of the reference boxes, and the weights of their colours."""
     # NumPy counts: boxes differ in size, and a program for each would have to be compiled.
-    bins, inner, outer = map(np.asarray, _sorted(jnp.asarray(frame), colours, places, num_parts))
+    bins, inner, outer = map(
+        np.asarray, _assign_bins(jnp.asarray(frame), colours, places, num_parts)
+    )
     counts, within = (
         jnp.asarray(_counts(bins, edges, colours.num_bins), places.dtype)
         for edges in (inner, outer)
     )
-    return _weighed(counts, within, weigh_colours)
+    return _weigh(counts, within, weigh_colours)
 
 
 @eqx.filter_jit
-def _weighed(counts, within, weigh_colours):
+def _weigh(counts, within, weigh_colours):
     """Histograms by the counts in boxes and in their surroundings, and the weights of colours."""
     weights = jnp.ones_like(counts)
     if weigh_colours:
@@ -195,7 +197,7 @@ def _weighed(counts, within, weigh_colours):
 
 
 @eqx.filter_jit
-def _sorted(frame, colours, places, num_parts):
+def _assign_bins(frame, colours, places, num_parts):
     """The bin of each pixel; the edges of each box and its bands, and those of its surroundings.
 
     The edges of a box are the rows at which its bands begin and end, its first column and its end.

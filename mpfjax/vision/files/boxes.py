@@ -55,7 +55,7 @@ def check_boxes(
     return rows
 
 
-def centred(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
+def to_centre(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
     """(x, y, w, h) with (x, y) moved from the top-left corner to the centre."""
     boxes = np.asarray(boxes, float)
     return np.concatenate([boxes[:, :2] + boxes[:, 2:] / 2, boxes[:, 2:]], axis=1)
@@ -82,8 +82,10 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     rows = list(read_rows(path, TRACK_FORM, TRACK_COLUMNS, least_id=0).values())
     flags = [row[6] for row in rows]
     if set(flags) == {0.0, 1.0}:
-        said = f"{path}: {flags.count(0.0)} rows are flagged 0, as a ground truth flags what does"
-        warn(f"{said} not count; read_truth leaves them out")
+        message = (
+            f"{path}: {flags.count(0.0)} rows are flagged 0, as a ground truth flags what does"
+        )
+        warn(f"{message} not count; read_truth leaves them out")
     return np.array([row[:6] for row in rows])
 
 
@@ -106,9 +108,9 @@ def read_detections(
         width, columns, form = 8, range(8, 11), "frame,id,x,y,w,h,score,class, from 0 on"
     if points:
         width, columns, form = 6, range(4, 7), "frame,id,x,y,score,class, as the lines before it"
-    found = read_rows(path, form, columns, holds="detections")
-    rows = [row[:width] for row in found.values()]
-    for number, row in zip(found, rows, strict=True):
+    lines = read_rows(path, form, columns, holds="detections")
+    rows = [row[:width] for row in lines.values()]
+    for number, row in zip(lines, rows, strict=True):
         is_class = all(each >= 0 and each % 1 == 0 for each in row[5 if points else 7 :])
         if len(row) != len(rows[0]) or not np.all(np.isfinite(row)) or not is_class:
             raise ValueError(f"{path}, line {number}: {shown(row)} is not {form}")
@@ -140,11 +142,11 @@ def format_tracks(rows: Float[np.ndarray, "rows columns"]) -> str:
     return "".join(
         f"{int(frame)},{int(track)},{x:.3f},{y:.3f},{w:.3f},{h:.3f}"
         f",{score:g},{int(kind) or -1},-1,-1\n"
-        for frame, track, x, y, w, h, score, kind in _described(rows)
+        for frame, track, x, y, w, h, score, kind in _with_score_and_class(rows)
     )
 
 
-def _described(rows: np.ndarray) -> np.ndarray:
+def _with_score_and_class(rows: np.ndarray) -> np.ndarray:
     """With a score of 1 and no class, where there are none."""
     return np.hstack([rows, np.tile([1.0, 0.0], (len(rows), 1))])[:, :8]
 
@@ -152,14 +154,14 @@ def _described(rows: np.ndarray) -> np.ndarray:
 def _as_csv(rows: np.ndarray) -> str:
     lines = csv.writer(file := io.StringIO(), lineterminator="\n")
     lines.writerow(("frame", "id", "x", "y", "w", "h", "score", "class"))
-    for frame, track, *numbers, kind in _described(rows).tolist():
+    for frame, track, *numbers, kind in _with_score_and_class(rows).tolist():
         lines.writerow((int(frame), int(track), *(f"{each:.7g}" for each in numbers), int(kind)))
     return file.getvalue()
 
 
 def _as_coco(rows: np.ndarray) -> str:
     """One annotation for each row; categories are the classes, of which 0 is that of all others."""
-    rows = _described(rows)
+    rows = _with_score_and_class(rows)
     annotations = [
         {
             "id": number, "image_id": int(frame), "category_id": int(kind), "track_id": int(track),

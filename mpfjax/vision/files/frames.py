@@ -93,7 +93,7 @@ def frame_rate(path: str | Path) -> float | None:
     path = Path(path)
     if path.is_dir():
         return read_sequence_info(path, path.parent).frame_rate
-    with _opened(path) as (_, stream):
+    with _open(path) as (_, stream):
         rate = stream.average_rate or stream.guessed_rate
     return float(rate) if rate and 0 < rate < math.inf else None
 
@@ -227,10 +227,10 @@ def _read_video(
 ) -> Iterator[np.ndarray | None]:
     number, damaged, latest = 0, [], -math.inf
     step = 0.0 if times is None else 1 / (frame_rate(path) or _RATE)
-    for number, frame in enumerate(_decoded(path), 1):
+    for number, frame in enumerate(_decode(path), 1):
         if number >= first and times is not None:
-            said = -math.inf if frame is None or frame.time is None else float(frame.time)
-            latest = said if said > latest else max(latest, -step) + step
+            stamp = -math.inf if frame is None or frame.time is None else float(frame.time)
+            latest = stamp if stamp > latest else max(latest, -step) + step
             times.append(latest)
         if number >= first and frame is None:
             damaged.append(number)
@@ -248,14 +248,14 @@ def _read_video(
         warn(f"{path}: {len(damaged)} frames are too damaged to be decoded: {numbers}")
 
 
-def _decoded(path: Path) -> Iterator[Any]:
+def _decode(path: Path) -> Iterator[Any]:
     """The frames of a video, their pixels not yet converted; None for each that is damaged.
 
     A frame comes later than its packet, and in another order. One that never comes is told by its
     time, which lies before that of a frame that has come. Where a file's times are not in order,
     None comes as soon as a packet cannot be decoded.
     """
-    with _opened(path) as (container, stream):
+    with _open(path) as (container, stream):
         stream.thread_type = "AUTO"
         packets, coming, latest, in_order = container.demux(stream), [], -math.inf, True
         # Sound files have packets without a frame as well, as before a first whole picture. Only
@@ -292,7 +292,7 @@ def _url(path: str | Path) -> str:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+def _open(path: Path) -> Iterator[tuple[Any, Any]]:
     """A video file and its first stream of frames."""
     library = optional("av", "av")
     with _naming(path, "a video"):
@@ -323,5 +323,5 @@ def _naming(path: Path, what: str) -> Iterator[None]:
         yield
     # For a damaged file decoders raise nearly anything, even SyntaxError and struct.error.
     except Exception as error:
-        said = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
-        raise ValueError(f"{path}: cannot be read as {what} ({said.splitlines()[0]})") from error
+        message = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
+        raise ValueError(f"{path}: cannot be read as {what} ({message.splitlines()[0]})") from error

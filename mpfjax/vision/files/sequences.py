@@ -93,30 +93,32 @@ def read_truth(path: str | Path, *, format: Format | None = None) -> Truth:
     for here, row in zip(table, rows.values(), strict=True):
         here[: len(row)] = row
     format = _format_of(path, name, table) if format is None else format
-    boxes, counted, ignored = table[:, :6], table[:, _FLAG] != 0, np.zeros((0, 6))
-    classes, known = table[:, _CLASS], _KNOWN.get(format)
-    if known is not None and not np.isin(classes, known).all():
-        raise ValueError(f"{path}: no class from {known[0]} to {known[-1]} in each eighth column")
+    boxes, counts, ignored = table[:, :6], table[:, _FLAG] != 0, np.zeros((0, 6))
+    classes, numbers = table[:, _CLASS], _KNOWN.get(format)
+    if numbers is not None and not np.isin(classes, numbers).all():
+        raise ValueError(
+            f"{path}: no class from {numbers[0]} to {numbers[-1]} in each eighth column"
+        )
     if format == "motchallenge":
         kinds = _NOT_TO_BLAME | ({_VEHICLE} if name.startswith("mot20") else set())
-        counted &= classes == _PEDESTRIAN
+        counts &= classes == _PEDESTRIAN
         # In the order of the file, by which TrackEval breaks ties.
-        ignored = _as_ignored(boxes[~counted], UNSCORED_OBJECT)
-        ignored[np.isin(classes, sorted(kinds))[~counted], 1] = IGNORED_OBJECT
+        ignored = _as_ignored(boxes[~counts], UNSCORED_OBJECT)
+        ignored[np.isin(classes, sorted(kinds))[~counts], 1] = IGNORED_OBJECT
     elif format == "visdrone":
-        counted &= np.isin(classes, _CATEGORIES[1:-1])
-        ignored = _as_ignored(boxes[~counted], IGNORED_REGION)
+        counts &= np.isin(classes, _CATEGORIES[1:-1])
+        ignored = _as_ignored(boxes[~counts], IGNORED_REGION)
     elif format == "uavdt":
-        counted[:] = True
+        counts[:] = True
         beside = path.with_name(re.sub(r"gt(_whole)?\.txt$", "gt_ignore.txt", path.name))
         if beside != path and beside.is_file():
             regions = read_rows(beside, TRACK_FORM, range(6, TRACK_COLUMNS.stop), holds=None)
             ignored = _as_ignored([row[:6] for row in regions.values()], IGNORED_REGION)
-    for number in np.array(list(rows))[counted & (boxes[:, 1] < 0)]:
+    for number in np.array(list(rows))[counts & (boxes[:, 1] < 0)]:
         raise ValueError(f"{path}, line {number}: an object without an id, which is at least 0")
     ignored = np.concatenate([ignored, _ignore_file(path.parent / "ignore.txt")])
     min_height = _KITTI_HEIGHT if name.startswith("kitti") else 0.0
-    return Truth(boxes[counted], ignored, min_height)
+    return Truth(boxes[counts], ignored, min_height)
 
 
 def _truth_file(path: Path) -> Path:
@@ -226,4 +228,4 @@ def last_frame(info: SequenceInfo, *rows: np.ndarray) -> int:
     """The number of the last frame where there are no images: as given, or the last of any rows."""
     if info.length is not None:
         return info.length
-    return int(max((found[:, 0].max() for found in rows if len(found)), default=0))
+    return int(max((table[:, 0].max() for table in rows if len(table)), default=0))

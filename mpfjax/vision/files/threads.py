@@ -27,7 +27,7 @@ def read_ahead(items: Iterable[T]) -> Iterator[Iterator[T]]:
     def start(call: Callable[..., Any], *arguments: Any) -> Future[Any]:
         return thread.submit(context.run, call, *arguments)
 
-    def taken() -> Iterator[Any]:
+    def take() -> Iterator[Any]:
         while (item := waiting.popleft().result()) is not end:
             waiting.append(start(next, coming, end))
             yield item
@@ -35,7 +35,7 @@ def read_ahead(items: Iterable[T]) -> Iterator[Iterator[T]]:
     with ThreadPoolExecutor(1) as thread:
         waiting = deque(start(next, coming, end) for _ in range(_WAITING))
         try:
-            yield taken()
+            yield take()
         finally:
             for future in waiting:
                 future.cancel()

@@ -58,7 +58,7 @@ class Rows:
         self.last = int(self.frames.max(initial=0)) if last is None else last
 
     def of_frame(self, number: int) -> Detections:
-        """Those of a frame."""
+        """The detections of a frame."""
         begin, end = np.searchsorted(self.frames, [number, number + 1])
         rows = self._rows[begin:end]
         at, width = self._score, rows.shape[1]
@@ -118,7 +118,7 @@ def first_step(detector: Detector, first: int | None, frames_per_second: float) 
     return first
 
 
-def observed(
+def observe(
     stills: Iterator[np.ndarray | None] | None, detector: Detector, first: int, coordinates: int = 4
 ) -> Iterator[tuple[int, np.ndarray | None, Detections | None]]:
     """Number, pixels and detections of each frame; None where no detector ran.
@@ -132,7 +132,7 @@ def observed(
     elif not callable(detector):
         coming = iter(detector)
 
-    def found_in(number: int, still: np.ndarray | None) -> Any:
+    def detect(number: int, still: np.ndarray | None) -> Any:
         if isinstance(detector, Rows):
             return detector.of_frame(number)
         if isinstance(detector, Mapping):
@@ -146,13 +146,13 @@ def observed(
 
     frames = zip(numbers, itertools.repeat(None)) if stills is None else enumerate(stills, first)
     for number, still in frames:
-        found = found_in(number, still)
-        if found is _END and still is None:
+        output = detect(number, still)
+        if output is _END and still is None:
             return
-        if found is _END:
+        if output is _END:
             raise ValueError(f"detections: end before the frames do, at frame {number}")
         named = f"detections: frame {number}"
-        yield number, still, None if found is None else Detections.of(found, named, coordinates)
+        yield number, still, None if output is None else Detections.of(output, named, coordinates)
     if isinstance(detector, Rows) and (late := detector.num_after(number)):
         warn(f"detections: {late} lie in frames after the last, {number}, and were left out")
     if next(coming, _END) is not _END or (isinstance(detector, Mapping) and number < last):

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
-from mpfjax.moves.objects.association import settled_replies
+from mpfjax.moves.objects.association import iterate_replies
 from mpfjax.vision.tracking.gaussian import Gaussian
 
 _FREEDOM = 4.0  # degrees, of Student's distribution of gaps
@@ -25,20 +25,24 @@ def compatible(a: Int[np.ndarray, " m"], b: Int[np.ndarray, " d"]) -> Bool[np.nd
 
 
 def unlikeness(
-    seen: Float[np.ndarray, "d bins"], known: Float[np.ndarray, "m bins"]
+    descriptors: Float[np.ndarray, "d bins"], references: Float[np.ndarray, "m bins"]
 ) -> Float[np.ndarray, "m d"]:
     """The cost of colours: that of B² = 1/4 is 0, as it is where there are none.
 
     B² is the squared Bhattacharyya distance of histograms, the mean over the bands of a box.
     """
-    alike = np.sqrt(known) @ np.sqrt(seen).T / np.maximum(np.sum(known, axis=1)[:, None], 1.0)
+    alike = (
+        np.sqrt(references)
+        @ np.sqrt(descriptors).T
+        / np.maximum(np.sum(references, axis=1)[:, None], 1.0)
+    )
     cost = _COLOUR_COST * (1 - alike - _UNDECIDED)
-    return np.where(np.any(known, axis=1, keepdims=True), cost, 0.0)
+    return np.where(np.any(references, axis=1, keepdims=True), cost, 0.0)
 
 
 def learned_descriptors(
-    known: Float[np.ndarray, "m bins"],
-    seen: Float[np.ndarray, "m bins"],
+    references: Float[np.ndarray, "m bins"],
+    descriptors: Float[np.ndarray, "m bins"],
     alone: Bool[np.ndarray, " m"],
 ) -> Float[np.ndarray, "m bins"]:
     """The histograms, or vectors, after those of the detections, 0 where there is none.
@@ -46,9 +50,9 @@ def learned_descriptors(
     The first one counts whole; later ones do where the object is `alone`: objects in contact would
     learn each other's colours.
     """
-    first, rate = ~known.any(axis=1), np.where(alone, _ADAPTATION, 0.0)
-    rate = np.where(seen.any(axis=1), np.where(first, 1.0, rate), 0.0)[:, None]
-    return (1 - rate) * known + rate * seen
+    first, rate = ~references.any(axis=1), np.where(alone, _ADAPTATION, 0.0)
+    rate = np.where(descriptors.any(axis=1), np.where(first, 1.0, rate), 0.0)[:, None]
+    return (1 - rate) * references + rate * descriptors
 
 
 def mahalanobis(
@@ -88,7 +92,7 @@ def marginals(log_odds: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
     """
     highest = np.maximum(np.max(log_odds, axis=1, initial=0.0), 0.0)
     pairs, missed = np.exp(log_odds - highest[:, None]), np.exp(-highest) + _LEAST
-    weighed = pairs * settled_replies(pairs, missed, np.ones(pairs.shape[1]))
+    weighed = pairs * iterate_replies(pairs, missed, np.ones(pairs.shape[1]))
     return weighed / (missed + np.sum(weighed, axis=1))[:, None]
 
 

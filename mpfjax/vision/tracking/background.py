@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from mpfjax.checks import Count, Positive, checked
 from mpfjax.vision.files.frames import check_frame
-from mpfjax.vision.tracking.optical_flow import opencv, reduced
+from mpfjax.vision.tracking.optical_flow import opencv, reduce
 
 # What OpenCV's mask holds where a pixel is foreground; a shadow has another value.
 _FOREGROUND = 255
@@ -101,23 +101,23 @@ class BackgroundSubtraction:
             raise ValueError(f"frame: {frame.shape} is not the shape before it, {self._shape}")
         self._shape = frame.shape
         factor = int(np.ceil(np.sqrt(frame[..., 0].size / _MOST_PIXELS)))
-        small = reduced(np.ascontiguousarray(frame), factor)
+        small = reduce(np.ascontiguousarray(frame), factor)
         mask = self._background.apply(small, learningRate=rate)
         return (mask == _FOREGROUND).astype(np.uint8)
 
     def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
-        known = len(self._heights) >= _ENOUGH
-        usual = np.median(self._heights) if known else _UNKNOWN_HEIGHT * len(foreground)
+        has_heights = len(self._heights) >= _ENOUGH
+        usual = np.median(self._heights) if has_heights else _UNKNOWN_HEIGHT * len(foreground)
         gap = round(_LARGEST_GAP * float(usual))
         if gap > 0:
             # Vertically only: people who walk side by side must not be joined.
             line = np.ones((gap + 1, 1), np.uint8)
             foreground = self._cv2.morphologyEx(foreground, self._cv2.MORPH_CLOSE, line)
-        _, labels, found, _ = self._cv2.connectedComponentsWithStats(foreground, connectivity=8)
+        _, labels, stats, _ = self._cv2.connectedComponentsWithStats(foreground, connectivity=8)
         boxes = []
         # No part of a blob can be larger than the blob.
         least = self.area[0] * foreground.size
-        large = [(n, *place[:4]) for n, place in enumerate(found.tolist()) if n]
+        large = [(n, *place[:4]) for n, place in enumerate(stats.tolist()) if n]
         large = [blob for blob in large if blob[3] * blob[4] >= least]
         # An object that is partly outside the frame does not show its shape.
         bottom, right = foreground.shape
@@ -126,8 +126,8 @@ class BackgroundSubtraction:
                 self._aspects.append(h / w)
                 self._heights.append(h)
         # A blob lower than this many widths may be several objects; 0 where this is unknown.
-        known = len(self._aspects) >= _ENOUGH
-        widest = float(np.median(self._aspects)) if known else 0.0
+        has_aspects = len(self._aspects) >= _ENOUGH
+        widest = float(np.median(self._aspects)) if has_aspects else 0.0
         for label, x, y, w, h in large:
             blob = labels[y : y + h, x : x + w] == label
             boxes += self._cut(blob, x, y, widest)

@@ -31,8 +31,8 @@ class CameraState(NamedTuple):
     def after(
         self,
         predicted: Gaussian,
-        gone: Float[np.ndarray, "#m 2"],
-        known: bool,
+        displacements: Float[np.ndarray, "#m 2"],
+        is_known: bool,
         cost: Float[np.ndarray, "m d"],
         errors: Float[np.ndarray, "4"],
         places: Float[np.ndarray, "d 4"],
@@ -48,54 +48,54 @@ class CameraState(NamedTuple):
 
         with heavy-tailed noise for objects that move on their own. The posterior mean of c is
         computed by iterated weighted least squares, with Student's weights. σ_c² is the mean
-        product of the innovations of different objects: their own noises are independent. `gone`
-        is by how much a jolt, or the motion from pixels, has moved each object: where the latter is
-        `known`, c is what is left.
+        product of the innovations of different objects: their own noises are independent.
+        `displacements` is by how much a jolt, or the motion from pixels, has moved each object:
+        where the latter is `is_known`, c is what is left.
         """
         partner = argmax_pairs(np.maximum(-cost, 0.0))
         rows = np.flatnonzero(partner >= 0)
         gaps = places[partner[rows], :2] - predicted.place[rows, :2]
         variances = (predicted.var_place + (predicted.unit * errors) ** 2)[rows, :2]
-        prior = ((self.left if known else self.deviations) * box) ** 2
+        prior = ((self.left if is_known else self.deviations) * box) ** 2
         shift = np.zeros(2)
         for _ in range(_ROUNDS):
             trust = (_FREEDOM + 1) / (_FREEDOM * variances + (gaps - shift) ** 2)
             shift = np.sum(trust * gaps, axis=0) / (np.sum(trust, axis=0) + 1 / prior)
         n = len(rows)
-        told = max(n - 1, 0) / (n + 3)  # two objects tell less than many
-        weight = min(self.weight + told, 1 / _RATE)
-        all_of_it = (gaps + np.broadcast_to(gone, (len(partner), 2))[rows]) / box
-        deviations = _learned(self.deviations, all_of_it, told / weight)
-        left = _learned(self.left, gaps / box, told / weight) if known else self.left
+        information = max(n - 1, 0) / (n + 3)  # two objects tell less than many
+        weight = min(self.weight + information, 1 / _RATE)
+        all_of_it = (gaps + np.broadcast_to(displacements, (len(partner), 2))[rows]) / box
+        deviations = _learn(self.deviations, all_of_it, information / weight)
+        left = _learn(self.left, gaps / box, information / weight) if is_known else self.left
         return CameraState(deviations, left, weight), shift
 
 
-def jolted(
+def find_jolt(
     predicted: Gaussian,
     errors: Float[np.ndarray, "4"],
     places: Float[np.ndarray, "d 4"],
     unlike: Float[np.ndarray, "m d"],
-    seen: Int[np.ndarray, " m"],
+    num_strong: Int[np.ndarray, " m"],
     near: Bool[np.ndarray, " m"],
     counts: Bool[np.ndarray, " d"],
 ) -> Float[np.ndarray, "2"]:
     """The shift of a jolt that leaves most objects without a detection, zero if there was none.
 
-    `unlike` is infinite where the two are no pair, `seen` is 0 for what was not seen lately, and
-    `near` says which have a detection near them, and `counts` which detections are looked at. Where
-    at most half of the objects have, the shifts that bring one of the eight longest seen to one of
-    the two detections next to it are tried: a camera moves all by the same. The one that explains
-    most counts, if that is three quarters of them, and two more than without it.
+    `unlike` is infinite where the two are no pair, `num_strong` is 0 for what was not seen lately,
+    and `near` says which have a detection near them, and `counts` which detections are looked at.
+    Where at most half of the objects have, the shifts that bring one of the eight longest seen to
+    one of the two detections next to it are tried: a camera moves all by the same. The one that
+    explains most counts, if that is three quarters of them, and two more than without it.
     """
-    rows = np.flatnonzero(seen)
-    rows = rows[np.argsort(-seen[rows], kind="stable")]
+    rows = np.flatnonzero(num_strong)
+    rows = rows[np.argsort(-num_strong[rows], kind="stable")]
     still = int(near[rows].sum())
     if 2 * still > len(rows) or len(rows) < still + 2:
         return np.zeros(2)
     objects, unlike, places = predicted.at(rows), unlike[np.ix_(rows, counts)], places[counts]
 
-    def explained(shift: np.ndarray) -> int:
-        cost = mahalanobis(objects.shifted(shift), errors, places, unlike)
+    def count_explained(shift: np.ndarray) -> int:
+        cost = mahalanobis(objects.shift(shift), errors, places, unlike)
         return int((cost < 0).any(axis=1).sum())
 
     leaders = slice(_LEADERS)
@@ -103,13 +103,13 @@ def jolted(
     far = np.sum((gaps / objects.unit[leaders, None, :2]) ** 2, axis=2) + unlike[leaders]
     nearest = np.argsort(far, axis=1, kind="stable")[:, :_NEAREST]
     shifts = np.take_along_axis(gaps, nearest[..., None], axis=1).reshape(-1, 2)
-    numbers = np.array([explained(shift) for shift in shifts])
+    numbers = np.array([count_explained(shift) for shift in shifts])
     best = int(np.argmax(numbers)) if len(numbers) else 0
-    told = len(numbers) and numbers[best] > still + 1 and 4 * numbers[best] >= 3 * len(rows)
-    return shifts[best] if told else np.zeros(2)
+    is_jolt = len(numbers) and numbers[best] > still + 1 and 4 * numbers[best] >= 3 * len(rows)
+    return shifts[best] if is_jolt else np.zeros(2)
 
 
-def _learned(
+def _learn(
     deviations: Float[np.ndarray, "2"], gaps: Float[np.ndarray, "n 2"], rate: float
 ) -> Float[np.ndarray, "2"]:
     """The deviations after a frame with n innovations, in boxes."""

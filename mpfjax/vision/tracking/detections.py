@@ -10,7 +10,7 @@ from mpfjax.arrays import (
     to_rows,
 )
 from mpfjax.checks import shown, warn
-from mpfjax.vision.files.boxes import centred
+from mpfjax.vision.files.boxes import to_centre
 from mpfjax.vision.tracking.gaussian import places_of
 from mpfjax.vision.tracking.kinds import BOXES, Kind
 
@@ -39,35 +39,36 @@ class Detections(NamedTuple):
     vectors: Float[np.ndarray, "k e"] | None = None
 
     @classmethod
-    def of(cls, found: Any, named: str, coordinates: int = 4) -> "Detections":
+    def of(cls, output: Any, named: str, coordinates: int = 4) -> "Detections":
         """What users hand over: boxes, or points, or a tuple as (boxes, scores, classes).
 
         Raises `ValueError` for boxes that are not rows of four numbers, or points of two, for
         scores and classes that are not one number a box, for classes that are not whole numbers
         from 0 on, and for vectors that are not one finite row a box.
         """
-        several = isinstance(found, tuple) and len(found) in (2, 3)
-        given: tuple[Any, ...] = found if several or isinstance(found, cls) else (found,)
-        rows = to_rows(coordinates, named, given[0])
+        several = isinstance(output, tuple) and len(output) in (2, 3)
+        parts: tuple[Any, ...] = output if several or isinstance(output, cls) else (output,)
+        rows = to_rows(coordinates, named, parts[0])
         rest: list[Any] = []
-        for each, values in zip(cls._fields[1:3], given[1:], strict=False):
+        for each, values in zip(cls._fields[1:3], parts[1:], strict=False):
             if values is not None:
                 values = np.array(to_numbers(f"{named}: {each}")(values))
                 if len(values) != len(rows):
                     raise ValueError(f"{named}: {len(values)} {each} for {len(rows)} boxes")
             rest.append(values)
-        made = cls(rows, *rest)
-        if isinstance(found, cls) and found.vectors is not None:
-            vectors = np.asarray(found.vectors, float)
+        detections = cls(rows, *rest)
+        if isinstance(output, cls) and output.vectors is not None:
+            vectors = np.asarray(output.vectors, float)
             if vectors.ndim != 2 or len(vectors) != len(rows) or not np.isfinite(vectors).all():
-                said = f"{len(rows)} rows of finite numbers"
-                raise ValueError(f"{named}: vectors of shape {vectors.shape} are not {said}")
-            made = made._replace(vectors=vectors)
-        if made.classes is None:
-            return made
-        if (made.classes % 1 != 0).any() or (made.classes < 0).any():
-            raise ValueError(f"{named}: classes {shown(made.classes)} are no whole numbers from 0")
-        return made._replace(classes=made.classes.astype(int))
+                expected = f"{len(rows)} rows of finite numbers"
+                raise ValueError(f"{named}: vectors of shape {vectors.shape} are not {expected}")
+            detections = detections._replace(vectors=vectors)
+        if detections.classes is None:
+            return detections
+        if (detections.classes % 1 != 0).any() or (detections.classes < 0).any():
+            what = shown(detections.classes)
+            raise ValueError(f"{named}: classes {what} are no whole numbers from 0")
+        return detections._replace(classes=detections.classes.astype(int))
 
 
 class FrameDetections(NamedTuple):
@@ -124,15 +125,15 @@ class FrameDetections(NamedTuple):
         areas = np.prod(boxes[rows, 2:], axis=1)
         rows = rows[np.lexsort((rows, -areas, -scores[rows]))]
         classes = np.zeros(len(scores), int) if classes is None else classes
-        boxes = centred(boxes[rows]) if kind.has_boxes else boxes[rows] / kind.unit
+        boxes = to_centre(boxes[rows]) if kind.has_boxes else boxes[rows] / kind.unit
         about, extent = (scores[rows], classes[rows], rows), extent / kind.unit
         vectors = None if vectors is None else vectors[rows]
         return cls(boxes, *about, extent, left_out, tuple(warnings), vectors=vectors)
 
-    def at(self, chosen: np.ndarray | slice) -> "FrameDetections":
+    def at(self, rows: np.ndarray | slice) -> "FrameDetections":
         """Some of them."""
         names = ["boxes", "scores", "classes", "rows", *["vectors"] * (self.vectors is not None)]
-        return self._replace(**{name: getattr(self, name)[chosen] for name in names})
+        return self._replace(**{name: getattr(self, name)[rows] for name in names})
 
     def warn_of_first(self, before: Int[np.ndarray, "3"]) -> None:
         """Warn of each fault that comes for the first time: so many came before."""

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mpfjax.checks import Renamed
+
 # The share of a size's growth rate that is left after a frame.
 _GROWTH_KEPT = 0.9
 _FURTHER = np.log(20)  # a distance beyond which one in twenty is, as -log of its probability
@@ -32,7 +34,7 @@ class Gaussian(NamedTuple):
         return cls(*(np.zeros((0, *shape)) for _ in cls._fields))
 
     @classmethod
-    def begun(
+    def initial(
         cls,
         place: Float[np.ndarray, "*#n #k"],
         error: Float[np.ndarray, "*#n #k"],
@@ -47,7 +49,7 @@ class Gaussian(NamedTuple):
         """The units of length along each coordinate, by the mean box."""
         return units(self.place)
 
-    def predicted(
+    def predict(
         self,
         place_noise: Float[np.ndarray, "*#n #k"],
         velocity_noise: Float[np.ndarray, "*#n #k"],
@@ -59,18 +61,18 @@ class Gaussian(NamedTuple):
         In a frame x += v + noise and v += noise, with deviations in units of length.
         """
         left, sizes = _GROWTH_KEPT**frames, self.place.shape[-1] - 2
-        kept = np.array([1, 1, *[left] * sizes])
+        decay = np.array([1, 1, *[left] * sizes])
         reach = np.array([frames, frames, *[(1 - left) / (1 - _GROWTH_KEPT)] * sizes])
         return Gaussian(
             self.place + reach * self.velocity,
-            kept * self.velocity,
+            decay * self.velocity,
             self.var_place
             + frames * (2 * self.cov + frames * self.var_velocity + (unit * place_noise) ** 2),
             self.cov + frames * self.var_velocity,
             self.var_velocity + frames * (unit * velocity_noise) ** 2,
         )
 
-    def updated(
+    def update(
         self, detected: Float[np.ndarray, "*#n #k"], errors: Float[np.ndarray, "*#n #k"]
     ) -> tuple["Gaussian", Float[np.ndarray, "*n k"], Float[np.ndarray, "*n k"]]:
         """Kalman's update by a detection: the posterior, the innovations and their variances."""
@@ -86,7 +88,7 @@ class Gaussian(NamedTuple):
         )
         return posterior, gap, variance
 
-    def mixed_with(self, other: "Gaussian", share: Float[np.ndarray, "*n #4"]) -> "Gaussian":
+    def mix(self, other: "Gaussian", share: Float[np.ndarray, "*n #4"]) -> "Gaussian":
         """The moments of a mixture of this Gaussian, with weight `share`, and the other."""
         away, away_velocity = self.place - other.place, self.velocity - other.velocity
         means = (share * a + (1 - share) * b for a, b in zip(self, other, strict=True))
@@ -97,7 +99,7 @@ class Gaussian(NamedTuple):
             var_velocity=mixed.var_velocity + between * away_velocity**2,
         )
 
-    def shifted(self, shift: Float[np.ndarray, "2"]) -> "Gaussian":
+    def shift(self, shift: Float[np.ndarray, "2"]) -> "Gaussian":
         """The moments of what has been moved by (x, y)."""
         return self._replace(place=self.place + along(self.place, shift))
 
@@ -112,7 +114,7 @@ class Gaussian(NamedTuple):
         for moment, its in zip(self, other, strict=True):
             moment[rows] = its
 
-    def joined(self, other: "Gaussian") -> "Gaussian":
+    def append(self, other: "Gaussian") -> "Gaussian":
         """The rows of both, one after the other."""
         if not len(other.place):
             return self
@@ -137,12 +139,15 @@ class CameraMotion(NamedTuple):
         """No motion was found."""
         return cls(np.array([1.0, 0.0]), np.zeros(2), False)
 
-    def moved(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    moved = Renamed("moved", "move")
+    carried = Renamed("carried", "carry")
+
+    def move(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Where points are that stand still; as they are where the motion is unknown."""
         (a, b), shift = self.turn, self.shift
         return points @ np.array([[a, b], [-b, a]]) + shift if self.known else points
 
-    def carried(self, moments: Gaussian) -> Gaussian:
+    def carry(self, moments: Gaussian) -> Gaussian:
         """The moments of what moves with the picture; as they are where the motion is unknown.
 
         Means of places and velocities turn, sizes grow by the scale. Covariances along x and y are
@@ -153,14 +158,14 @@ class CameraMotion(NamedTuple):
         a, b = np.asarray(self.turn, float).tolist()
         growth = 0.5 * np.log(a**2 + b**2)
 
-        def turned(rows: np.ndarray, a: float, b: float, c: float) -> np.ndarray:
+        def rotate(rows: np.ndarray, a: float, b: float, c: float) -> np.ndarray:
             x, y = rows[..., :1], rows[..., 1:2]
             return np.concatenate([a * x + b * y, c * x + a * y, rows[..., 2:]], axis=-1)
 
         place, velocity, *spread = moments
-        place = turned(place, a, -b, b) + along(place, self.shift, growth)
-        spread = (turned(rows, a**2, b**2, b**2) for rows in spread)
-        return Gaussian(place, turned(velocity, a, -b, b), *spread)
+        place = rotate(place, a, -b, b) + along(place, self.shift, growth)
+        spread = (rotate(rows, a**2, b**2, b**2) for rows in spread)
+        return Gaussian(place, rotate(velocity, a, -b, b), *spread)
 
 
 def along(places: np.ndarray, of_place: np.ndarray, of_size: float = 0.0) -> np.ndarray:

@@ -48,7 +48,7 @@ class Lives(NamedTuple):
     """The identity of each object, and its counts of frames.
 
     - `identities`: (m,); `classes`: (m,), 0 for none; `scores`: (m,), of the latest detection.
-    - `seen`: (m,), in how many frames it had a strong detection.
+    - `num_strong`: (m,), in how many frames it had a strong detection.
     - `unseen`, `unsure`: (m,), for how many frames it has had no detection, and no strong one.
     - `confirmed`: (m,), whether it has had enough; `shown`: (m,), whether it should be shown.
     - `odds`: (m,), in logarithms, that its points are not of nobody, to those that confirm it; 0 of
@@ -58,7 +58,7 @@ class Lives(NamedTuple):
     identities: Int[np.ndarray, " m"]
     classes: Int[np.ndarray, " m"]
     scores: Float[np.ndarray, " m"]
-    seen: Int[np.ndarray, " m"]
+    num_strong: Int[np.ndarray, " m"]
     unseen: Float[np.ndarray, " m"]
     unsure: Float[np.ndarray, " m"]
     confirmed: Bool[np.ndarray, " m"]
@@ -66,27 +66,27 @@ class Lives(NamedTuple):
     odds: Float[np.ndarray, " m"]
 
     @classmethod
-    def begun(
+    def initial(
         cls,
         identities: Int[np.ndarray, " k"],
         classes: Int[np.ndarray, " k"],
         at_once: Bool[np.ndarray, " k"],
         odds: float = 0.0,
     ) -> "Lives":
-        """Those of new objects; `at_once`: which are confirmed, and shown, from the first."""
+        """The lives of new objects; `at_once`: which are confirmed, and shown, from the first."""
         one, sure = np.ones_like(identities), at_once
         none = 0.0 * one
         return cls(identities, classes, none, one, none, none, sure, sure, none + odds)
 
     def at(self, rows: np.ndarray) -> "Lives":
-        """Those of some objects."""
+        """The lives of some objects."""
         return Lives(*(row[rows] for row in self))
 
-    def joined(self, other: "Lives") -> "Lives":
-        """Those of both, one after the other."""
+    def append(self, other: "Lives") -> "Lives":
+        """The lives of these objects, followed by the others."""
         return Lives(*map(np.concatenate, zip(self, other, strict=True)))
 
-    def described(
+    def describe(
         self,
         detected: Bool[np.ndarray, " m"],
         classes: Int[np.ndarray, " m"],
@@ -98,7 +98,7 @@ class Lives(NamedTuple):
             scores=np.where(detected, scores, self.scores),
         )
 
-    def counted(
+    def advance(
         self,
         detected: Bool[np.ndarray, " m"],
         strong: Bool[np.ndarray, " m"],
@@ -117,16 +117,21 @@ class Lives(NamedTuple):
         once and has had no strong detections since ends as soon as it is no longer shown: after
         `coast` frames without a detection, or three tenths of a second without a strong one.
         """
-        seen = self.seen + strong
+        num_strong = self.num_strong + strong
         unseen = np.where(detected, 0.0, self.unseen + frames)
         unsure = np.where(strong, 0.0, self.unsure + frames)
         odds = self.odds + gained
-        confirmed = self.confirmed | ((seen >= _CONFIRMED) & (odds >= 0))
+        confirmed = self.confirmed | ((num_strong >= _CONFIRMED) & (odds >= 0))
         recent = confirmed & (unseen <= coast) & (unsure <= spans.unsure)
         lives = self._replace(
-            seen=seen, unseen=unseen, unsure=unsure, confirmed=confirmed, shown=recent, odds=odds
+            num_strong=num_strong,
+            unseen=unseen,
+            unsure=unsure,
+            confirmed=confirmed,
+            shown=recent,
+            odds=odds,
         )
-        in_the_way = full & (seen < _CONFIRMED)
+        in_the_way = full & (num_strong < _CONFIRMED)
         tentative = 0 if full else _TENTATIVE * frames
         most = np.where(confirmed, np.where(in_the_way, spans.coast, spans.patience), tentative)
         return lives, unseen <= most
@@ -213,11 +218,13 @@ class Duplicates(NamedTuple):
         pairs = elders[:, None] == identities
         k = len(elders)
         apart = (overlaps[:k] < _BESIDE) & detected[:k, None] & detected
-        proved = (pairs & apart).any(axis=1)
+        is_object = (pairs & apart).any(axis=1)
         older = identities < identities[k:, None]
         beside = np.where(older, overlaps[k:], 0.0)
         nearest = identities[np.argmax(beside, axis=1)] if len(beside) else identities[:0]
-        begun = np.where(np.max(beside, axis=1, initial=0.0) > _BESIDE, nearest, 0)
-        objects = KEPT * self.objects + np.sum(proved)
+        new_elders = np.where(np.max(beside, axis=1, initial=0.0) > _BESIDE, nearest, 0)
+        objects = KEPT * self.objects + np.sum(is_object)
         duplicates = KEPT * self.duplicates + ended
-        return Duplicates(np.append(np.where(proved, 0, elders), begun), objects, duplicates)
+        return Duplicates(
+            np.append(np.where(is_object, 0, elders), new_elders), objects, duplicates
+        )

@@ -84,11 +84,11 @@ class NoiseState(NamedTuple):
         none = np.zeros((_RIVALS[coordinates].shape[2], coordinates))
         return cls(Gaussian.none(*none.shape), none, 0.0 * start, 0.0, start, scale, noises)
 
-    def predicted(self, frames: float) -> "NoiseState":
+    def predict(self, frames: float) -> "NoiseState":
         """Every object under every candidate, later; each candidate has its own units."""
         scale = self.scale[:, None, None, None]
         _, place, velocity = scale * _RIVALS[self.evidence.shape[1]]
-        moments = self.moments.predicted(place, velocity, self.moments.unit, frames)
+        moments = self.moments.predict(place, velocity, self.moments.unit, frames)
         return self._replace(moments=moments)
 
     def after(
@@ -111,7 +111,7 @@ class NoiseState(NamedTuple):
         """
         predicted = self.moments.at(rows)
         unit = predicted.unit
-        posterior, gap, variance = predicted.updated(
+        posterior, gap, variance = predicted.update(
             places[:, None], unit * _RIVALS[self.evidence.shape[1]][0]
         )
         self.moments.put(rows, posterior)
@@ -125,15 +125,17 @@ class NoiseState(NamedTuple):
         prior, doubts, _ = _BEFORE[evidence.shape[1]]
         logs = np.log(_RIVALS[evidence.shape[1]][:, 0])
         away = (logs - np.log(prior)[:, None]) / doubts[:, None, None]
-        believed = softmax(evidence - 0.5 * np.sum(away**2, axis=0), axis=0)
-        means = self.scale[:, None] * np.exp(np.sum(believed[None] * logs, axis=1))
-        told = evidence, squares, newborn, self.start, self.scale
-        return NoiseState(self.moments, *told, Noises(*means, speed=speed))
+        posterior_weights = softmax(evidence - 0.5 * np.sum(away**2, axis=0), axis=0)
+        means = self.scale[:, None] * np.exp(np.sum(posterior_weights[None] * logs, axis=1))
+        rest = evidence, squares, newborn, self.start, self.scale
+        return NoiseState(self.moments, *rest, Noises(*means, speed=speed))
 
-    def begun(self, places: Float[np.ndarray, "n k"], speed: Float[np.ndarray, " k"]) -> Gaussian:
+    def newborns(
+        self, places: Float[np.ndarray, "n k"], speed: Float[np.ndarray, " k"]
+    ) -> Gaussian:
         """New objects under every candidate."""
         unit = units(places)[:, None]
-        return Gaussian.begun(
+        return Gaussian.initial(
             places[:, None], unit * _RIVALS[self.evidence.shape[1]][0], unit * speed
         )
 
@@ -144,5 +146,5 @@ class NoiseState(NamedTuple):
         """
         squares = (grown.velocity**2 + grown.var_velocity) / grown.unit**2
         trust = (_FREEDOM + 1) / (_FREEDOM + squares / self.noises.speed**2)
-        kept, number = (1 - 1 / _LATEST) ** len(squares), len(squares)
-        return kept * self.squares + np.sum(trust * squares, axis=0), kept * self.newborn + number
+        decay, number = (1 - 1 / _LATEST) ** len(squares), len(squares)
+        return decay * self.squares + np.sum(trust * squares, axis=0), decay * self.newborn + number

@@ -56,18 +56,18 @@ class OpticalFlow:
         factor = max(round(frame.shape[1] / _WIDTH), 1)
         # Grey first: OpenCV reduces one channel in a third of the time of three.
         grey = self._cv2.cvtColor(np.ascontiguousarray(frame), self._cv2.COLOR_RGB2GRAY)
-        picture = reduced(grey, factor)
+        picture = reduce(grey, factor)
         before, self._before = self._before, picture
         left, self._boxes = self._boxes, boxes / factor
         if before is None or before.shape != picture.shape or min(picture.shape) < _SMALLEST:
             return CameraMotion.unknown()
-        start, end = self._followed(before, picture, left)
+        start, end = self._follow(before, picture, left)
         gaps = end[:, None] - self._boxes[None, :, :2]
         within = (gaps >= 0) & (gaps <= self._boxes[None, :, 2:])
         away = ~np.any(within.all(axis=2), axis=1)
-        return self._fitted(start[away], end[away], factor)
+        return self._fit(start[away], end[away], factor)
 
-    def _followed(
+    def _follow(
         self, before: np.ndarray, picture: np.ndarray, boxes: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Corners outside of the boxes, and where they are now."""
@@ -82,13 +82,13 @@ class OpticalFlow:
         if start is None or len(start) < _FEWEST:
             return np.zeros((0, 2)), np.zeros((0, 2))
         ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ROUNDS, _STILL)
-        end, found, _ = cv2.calcOpticalFlowPyrLK(
+        end, status, _ = cv2.calcOpticalFlowPyrLK(
             before, picture, start, None, winSize=_WINDOW, maxLevel=_LEVELS, criteria=ends
         )
-        kept = found[:, 0] == 1
-        return start[kept, 0], end[kept, 0]
+        is_tracked = status[:, 0] == 1
+        return start[is_tracked, 0], end[is_tracked, 0]
 
-    def _fitted(self, start: np.ndarray, end: np.ndarray, factor: int) -> CameraMotion:
+    def _fit(self, start: np.ndarray, end: np.ndarray, factor: int) -> CameraMotion:
         """The similarity between the corners, in pixels of the frame, if most agree with one."""
         if len(start) < _FEWEST:
             return CameraMotion.unknown()
@@ -106,7 +106,7 @@ class OpticalFlow:
         )
 
 
-def reduced(frame: np.ndarray, factor: int) -> np.ndarray:
+def reduce(frame: np.ndarray, factor: int) -> np.ndarray:
     """The means over squares of pixels, so many along each side."""
     if factor == 1:
         return frame

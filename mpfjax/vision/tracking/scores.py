@@ -91,15 +91,17 @@ class ScoreState(NamedTuple):
         spread = sure - lowest
         shares = (scores - lowest) / spread if spread > 0 else np.ones_like(scores)
         single = ~np.triu(overlaps > _DUPLICATE, 1).any(axis=0)
-        state = self._continued(boxes[single], moved, shares[single], frames, lasting, variance)
+        state = self._continue_chains(
+            boxes[single], moved, shares[single], frames, lasting, variance
+        )
         strong = lowest + state.strong_share() * spread
         # Where all scores are equal, rounding must not put them below the threshold.
         weak = min(lowest + WEAK * spread, strong) if len(recent) else -np.inf
         return state._replace(recent=recent, weak=weak, strong=strong)
 
-    def _continued(
+    def _continue_chains(
         self,
-        found: Float[np.ndarray, "d k"],
+        detections: Float[np.ndarray, "d k"],
         moved: Float[np.ndarray, "c k"],
         shares: Float[np.ndarray, " d"],
         frames: float,
@@ -109,30 +111,35 @@ class ScoreState(NamedTuple):
         """The chains after a frame whose detections have these shares of a sure score."""
         since = frames * (1 + self.unseen[:, None])
         ahead = moved + np.pad(since * self.steps, ((0, 0), (0, moved.shape[1] - 2)))
-        nearness = np.zeros((len(moved), len(found)))
+        nearness = np.zeros((len(moved), len(detections)))
         # At a low rate what is fast leaves its last box; elsewhere steps are mostly errors.
         for boxes, certainty in ((ahead, 0), (self.boxes, 1), (moved, 1)):
-            *pairs, common = overlapping(boxes, found, _SAME, variance)
+            *pairs, common = overlapping(boxes, detections, _SAME, variance)
             pairs = tuple(pairs)
             nearness[pairs] = np.maximum(nearness[pairs], certainty + common)
         rows = argmax_pairs(nearness)
-        seen = rows >= 0
-        held, new = np.flatnonzero(seen), np.setdiff1d(np.arange(len(found)), rows)
+        is_detected = rows >= 0
+        continuing, new = (
+            np.flatnonzero(is_detected),
+            np.setdiff1d(np.arange(len(detections)), rows),
+        )
         steps = np.concatenate([self.steps, np.zeros((len(new), 2))])
-        steps[held] = (found[rows[held]] - moved[held])[:, :2] / since[held]
+        steps[continuing] = (detections[rows[continuing]] - moved[continuing])[:, :2] / since[
+            continuing
+        ]
         # New chains come after the others.
-        rows, seen = np.append(rows, new), np.append(seen, new >= 0)
+        rows, is_detected = np.append(rows, new), np.append(is_detected, new >= 0)
         none = np.zeros(len(new), int)
-        boxes = np.concatenate([moved, found[new]])
-        boxes[seen] = found[rows[seen]]
+        boxes = np.concatenate([moved, detections[new]])
+        boxes[is_detected] = detections[rows[is_detected]]
         pending = np.concatenate([self.pending, np.zeros((len(new), _BINS))])
-        own = np.where(seen, np.append(shares, 0.0)[rows], 0.0)
-        bins = np.clip((own * _BINS).astype(int), 0, _BINS - 1)
-        pending[seen, bins[seen]] += 1
+        share_of_each = np.where(is_detected, np.append(shares, 0.0)[rows], 0.0)
+        bins = np.clip((share_of_each * _BINS).astype(int), 0, _BINS - 1)
+        pending[is_detected, bins[is_detected]] += 1
         age = np.append(self.age + frames, none + 1)
-        proved = seen & ((own >= _SURE) | (age >= lasting))
-        sure = np.append(self.sure, none > 0) | proved
-        unseen = np.where(seen, 0, np.append(self.unseen, none) + 1)
+        is_sure = is_detected & ((share_of_each >= _SURE) | (age >= lasting))
+        sure = np.append(self.sure, none > 0) | is_sure
+        unseen = np.where(is_detected, 0, np.append(self.unseen, none) + 1)
         ended = unseen >= _GONE
         good, bad = pending[sure].sum(axis=0), pending[ended & ~sure].sum(axis=0)
         chains = boxes, steps, unseen, age, sure, np.where(sure[:, None], 0.0, pending)

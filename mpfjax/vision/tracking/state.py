@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mpfjax.checks import Renamed
 from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.tracking.camera import CameraState
 from mpfjax.vision.tracking.clutter import Clutter
@@ -29,8 +30,8 @@ class TrackerState(NamedTuple):
     - `clutter`: of points, how densely those of nobody lie.
     - `last_identity`: the highest ever given.
     - `full`: whether there was no room for a new object in the last frame.
-    - `begun`: whether there was a frame on which the detector ran; `waited`: for how many frames it
-      has not run since.
+    - `has_begun`: whether there was a frame on which the detector ran; `waited`: for how many
+      frames it has not run since.
     - `time`: in seconds, of the last frame; None where nobody said it.
     - `forms`: (3,), of the first boxes, as `FrameDetections.form_counts` has them.
     - `number`: how many frames there were; `left_out`: (3,), how many detections could not be
@@ -50,12 +51,13 @@ class TrackerState(NamedTuple):
     clutter: Clutter = Clutter()
     last_identity: int = 0
     full: bool = False
-    begun: bool = False
+    has_begun: bool = False
     waited: float = 0.0
     time: float | None = None
     number: int = 0
     left_out: Int[np.ndarray, "3"] = np.zeros(len(FAULTS), int)
     forms: Int[np.ndarray, "3"] = np.zeros(3, int)
+    begun = Renamed("begun", "has_begun")
 
 
 class Tracks(NamedTuple):

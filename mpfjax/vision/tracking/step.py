@@ -13,7 +13,7 @@ from mpfjax.vision.tracking.associate import (
     probabilities,
     unlikeness,
 )
-from mpfjax.vision.tracking.camera import jolted
+from mpfjax.vision.tracking.camera import find_jolt
 from mpfjax.vision.tracking.detections import FrameDetections
 from mpfjax.vision.tracking.gaussian import (
     CameraMotion,
@@ -86,14 +86,14 @@ class _Matches(NamedTuple):
         filled = np.concatenate([values, np.full((1, *values.shape[1:]), none, values.dtype)])
         return filled[self.columns]
 
-    def renewed(self, stays: Bool[np.ndarray, " m"], born: Int[np.ndarray, " b"]) -> "_Matches":
-        """Those of the objects that stay, and of those that begin at detections."""
+    def renew(self, stays: Bool[np.ndarray, " m"], born: Int[np.ndarray, " b"]) -> "_Matches":
+        """The matches of the objects that stay, and of those that begin at detections."""
         sure = np.ones(len(born))
         new = born, sure > 0, sure > 0, sure, 0.0 * sure
         return _Matches(*(np.append(a[stays], b) for a, b in zip(self, new, strict=True)))
 
 
-def advanced(
+def advance(
     tracker: "ObjectTracker",
     state: TrackerState,
     detections: FrameDetections | None,
@@ -101,47 +101,47 @@ def advanced(
     time: float | None = None,
 ) -> tuple[TrackerState, Tracks]:
     """A step with a frame's detections, or None where no detector ran."""
-    frames, time = _elapsed(tracker, state, time)
+    frames, time = _frames_since(tracker, state, time)
     state, displacements, chains = _predicted(tracker.kind, state, motion, frames)
     frames += state.waited
     state = state._replace(number=state.number + 1, time=time, waited=frames)
     if detections is None:
         # Objects move on, and nothing is held against them.
         state = state._replace(scores=state.scores._replace(boxes=chains), full=False)
-        none = np.full(len(state.lives.seen), -1)
+        none = np.full(len(state.lives.num_strong), -1)
         return state, _tracks(tracker.kind, state, none, np.zeros(len(none)), 0)
     detections.warn_of_first(state.left_out)
     state = state._replace(forms=detections.form_counts(state.forms))
-    state, frame = _compared(tracker, state, detections, frames)
+    state, frame = _compare(tracker, state, detections, frames)
     is_known = motion is not None and bool(motion.known)
     state, shift = _with_camera(tracker.kind, state, frame, is_known, displacements)
-    state, frame = _judged(tracker, state, frame, chains + along(chains, shift))
-    return _associated(tracker, state, frame)
+    state, frame = _judge(tracker, state, frame, chains + along(chains, shift))
+    return _associate(tracker, state, frame)
 
 
-def _associated(
+def _associate(
     tracker: "ObjectTracker", state: TrackerState, frame: _Frame
 ) -> tuple[TrackerState, Tracks]:
     """The part of a step that decides whose the detections are, with what follows from it."""
-    matches = _matched(tracker.kind, state, frame)
-    predicted, state = state.objects, _updated(state, frame, matches)
-    state, stays = _survived(state, frame, matches, predicted)
-    wanted = _unexplained(tracker, state, frame, matches, stays)
-    born = np.flatnonzero(wanted)[: tracker.max_objects - np.sum(stays)]
-    state = _renewed(tracker.kind, state, frame, matches, stays, born)
-    renewed = matches.renewed(stays, born)
-    state = _described(tracker, state, frame, matches, renewed, stays)
+    matches = _match(tracker.kind, state, frame)
+    predicted, state = state.objects, _update(state, frame, matches)
+    state, stays = _survive(state, frame, matches, predicted)
+    is_birth = _births(tracker, state, frame, matches, stays)
+    born = np.flatnonzero(is_birth)[: tracker.max_objects - np.sum(stays)]
+    state = _renew(tracker.kind, state, frame, matches, stays, born)
+    renewed = matches.renew(stays, born)
+    state = _describe(tracker, state, frame, matches, renewed, stays)
     number, detections = len(frame.places) - int(matches.matched.sum()), frame.detections
     state = state._replace(
-        clutter=state.clutter.after(frame.places, number if state.begun else 0),
-        full=bool(np.sum(wanted) > len(born)), begun=True, waited=0.0,
+        clutter=state.clutter.after(frame.places, number if state.has_begun else 0),
+        full=bool(np.sum(is_birth) > len(born)), has_begun=True, waited=0.0,
         left_out=state.left_out + detections.left_out,
     )  # fmt: skip
     rows, left_out = renewed.values(detections.rows, -1), int(detections.left_out.sum())
     return state, _tracks(tracker.kind, state, rows, renewed.probabilities, left_out)
 
 
-def _elapsed(
+def _frames_since(
     tracker: "ObjectTracker", state: TrackerState, time: float | None
 ) -> tuple[float, float | None]:
     """Frames since the last one, and the time of this one in seconds, None where unknown."""
@@ -164,17 +164,17 @@ def _predicted(
     objects, noise, chains = state.objects, state.noise, state.scores.boxes
     if motion is not None:
         motion = motion._replace(shift=motion.shift / kind.unit)
-        objects = motion.carried(objects)
-        noise = noise._replace(moments=motion.carried(noise.moments))
-        chains = np.concatenate([motion.moved(chains[:, :2]), chains[:, 2:]], axis=1)
+        objects = motion.carry(objects)
+        noise = noise._replace(moments=motion.carry(noise.moments))
+        chains = np.concatenate([motion.move(chains[:, :2]), chains[:, 2:]], axis=1)
     displacements = (objects.place - state.objects.place)[:, :2]
     _, place, velocity, _ = noise.noises
-    objects = objects.predicted(place, velocity, objects.unit, frames)
-    state = state._replace(objects=objects, noise=noise.predicted(frames))
+    objects = objects.predict(place, velocity, objects.unit, frames)
+    state = state._replace(objects=objects, noise=noise.predict(frames))
     return state, displacements, chains
 
 
-def _compared(
+def _compare(
     tracker: "ObjectTracker", state: TrackerState, detections: FrameDetections, frames: float
 ) -> tuple[TrackerState, _Frame]:
     """What pairs cost beside distance, and which detections may be of one object."""
@@ -219,12 +219,12 @@ def _with_camera(
         return state, np.zeros(2)
     lives, errors = state.lives, state.noise.noises.errors
     places, scores, costs = frame.places, frame.scores, frame.costs
-    seen = np.where(lives.confirmed & (lives.unseen == 0), lives.seen, 0)
+    num_strong = np.where(lives.confirmed & (lives.unseen == 0), lives.num_strong, 0)
     counts, strong = (scores >= least for least in (state.scores.weak, state.scores.strong))
     cost = mahalanobis(state.objects, errors, places, costs)
     near = np.asarray(np.any((cost < 0) & counts, axis=1))
-    jolt = jolted(state.objects, errors, places, costs, seen, near, counts)
-    objects, confirmed = state.objects.shifted(jolt), lives.confirmed
+    jolt = find_jolt(state.objects, errors, places, costs, num_strong, near, counts)
+    objects, confirmed = state.objects.shift(jolt), lives.confirmed
     if jolt.any():
         cost = mahalanobis(objects, errors, places, costs)
     box = np.exp(objects.place[confirmed, 2:].sum(axis=0) / max(confirmed.sum(), 1))
@@ -233,12 +233,12 @@ def _with_camera(
         objects.at(confirmed), displacements[confirmed] + jolt, is_known, *strong_pairs, box
     )
     shift = jolt + shift
-    noise = state.noise._replace(moments=state.noise.moments.shifted(shift))
-    objects = state.objects.shifted(shift)
+    noise = state.noise._replace(moments=state.noise.moments.shift(shift))
+    objects = state.objects.shift(shift)
     return state._replace(objects=objects, noise=noise, camera=camera), shift
 
 
-def _judged(
+def _judge(
     tracker: "ObjectTracker", state: TrackerState, frame: _Frame, chains: Float[np.ndarray, "c k"]
 ) -> tuple[TrackerState, _Frame]:
     """With the thresholds of the scores, and which detections are strong."""
@@ -255,7 +255,7 @@ def _judged(
     return state._replace(scores=learned), frame
 
 
-def _matched(kind: Kind, state: TrackerState, frame: _Frame) -> _Matches:
+def _match(kind: Kind, state: TrackerState, frame: _Frame) -> _Matches:
     """The detection of each object, and the probability that it is its own."""
     others = 0.0 if kind.has_boxes else state.clutter.cost
     errors = state.noise.noises.errors
@@ -277,25 +277,25 @@ def _matched(kind: Kind, state: TrackerState, frame: _Frame) -> _Matches:
     return _Matches(columns, matched, strong, probability, gains)
 
 
-def _updated(state: TrackerState, frame: _Frame, matches: _Matches) -> TrackerState:
+def _update(state: TrackerState, frame: _Frame, matches: _Matches) -> TrackerState:
     """The objects follow their detections by the probabilities of the pairs."""
     rows = np.flatnonzero(matches.matched)
     before, place = state.objects.at(rows), frame.places[matches.columns[rows]]
     wider = np.where(matches.strong[rows], 1.0, WEAK_ERROR)[:, None]
-    updated, _, _ = before.updated(place, units(place) * state.noise.noises.errors * wider)
+    updated, _, _ = before.update(place, units(place) * state.noise.noises.errors * wider)
     objects = Gaussian(*map(np.copy, state.objects))
-    objects.put(rows, updated.mixed_with(before, matches.probabilities[rows, None]))
+    objects.put(rows, updated.mix(before, matches.probabilities[rows, None]))
     return state._replace(objects=objects)
 
 
-def _survived(
+def _survive(
     state: TrackerState, frame: _Frame, matches: _Matches, predicted: Gaussian
 ) -> tuple[TrackerState, Bool[np.ndarray, " m"]]:
     """Counts of frames, which objects live on, and how right the predictions of the lost were."""
     lives, spans, matched = state.lives, frame.spans, matches.matched
     coast = state.coasting.longest(spans)
     counts = matched, matches.strong, frame.frames, spans, coast, state.full
-    counted, stays = lives.counted(*counts, matches.gains)
+    lives_now, stays = lives.advance(*counts, matches.gains)
     extent = frame.detections.extent
     stays &= within(boxes_of(state.objects.place), extent, centred=~matched)
     right, rows = matched.copy(), np.flatnonzero(matched)
@@ -304,10 +304,10 @@ def _survived(
     ended = lives.confirmed & np.where(matched, ~right, ~stays)
     unseen = lives.unseen + np.where(matched, 0.0, frame.frames)
     coasting = state.coasting.after(unseen, lives.confirmed & right, ended, spans)
-    return state._replace(lives=counted, coasting=coasting), stays
+    return state._replace(lives=lives_now, coasting=coasting), stays
 
 
-def _unexplained(
+def _births(
     tracker: "ObjectTracker",
     state: TrackerState,
     frame: _Frame,
@@ -318,12 +318,12 @@ def _unexplained(
     boxes, classes, extent = (getattr(frame.detections, n) for n in ("boxes", "classes", "extent"))
     covered = overlap(boxes_of(state.objects.place[stays]), boxes) > _BIRTH_OVERLAP
     covered &= _may_be_one(tracker, state.lives.classes[stays], classes)
-    wanted = frame.strong & within(boxes, extent) & ~covered.any(axis=0)
-    wanted[matches.columns[matches.matched]] = False
-    return wanted & ~(np.triu(frame.overlaps > _BIRTH_OVERLAP, 1) & wanted[:, None]).any(axis=0)
+    is_birth = frame.strong & within(boxes, extent) & ~covered.any(axis=0)
+    is_birth[matches.columns[matches.matched]] = False
+    return is_birth & ~(np.triu(frame.overlaps > _BIRTH_OVERLAP, 1) & is_birth[:, None]).any(axis=0)
 
 
-def _renewed(
+def _renew(
     kind: Kind,
     state: TrackerState,
     frame: _Frame,
@@ -335,30 +335,30 @@ def _renewed(
     objects, lives, noises = state.objects, state.lives, state.noise.noises
     matched, places = matches.matched, frame.places[born]
     teaches = matches.strong & stays
-    experienced = teaches & lives.confirmed & (lives.seen >= _FIRST)
-    grown = objects.at(teaches & (lives.seen == _FIRST))
+    experienced = teaches & lives.confirmed & (lives.num_strong >= _FIRST)
+    grown = objects.at(teaches & (lives.num_strong == _FIRST))
     its = frame.places[matches.columns[matched]]
     noise = state.noise.after(matched, its, experienced[matched], grown)
-    moments = noise.moments.at(stays).joined(noise.begun(places, noises.speed))
+    moments = noise.moments.at(stays).append(noise.newborns(places, noises.speed))
     unit = units(places)
-    start = Gaussian.begun(places, unit * noises.errors, unit * noises.speed)
+    start = Gaussian.initial(places, unit * noises.errors, unit * noises.speed)
     names = state.last_identity + 1 + np.arange(len(born))
     # The scores of a first frame have hardly a rank: a single one is always the highest.
-    is_first = kind.has_boxes and not state.begun
+    is_first = kind.has_boxes and not state.has_begun
     at_once = is_first & (frame.scores[born] >= STRONG)
-    begun = Lives.begun(names, frame.detections.classes[born], at_once, kind.odds)
+    new_lives = Lives.initial(names, frame.detections.classes[born], at_once, kind.odds)
     colours, vectors = (
         np.append(rows[stays], np.zeros((len(born), rows.shape[1])), axis=0)
         for rows in (state.colours, state.vectors)
     )
     return state._replace(
-        objects=objects.at(stays).joined(start), lives=lives.at(stays).joined(begun),
+        objects=objects.at(stays).append(start), lives=lives.at(stays).append(new_lives),
         noise=noise._replace(moments=moments), colours=colours, vectors=vectors,
         last_identity=state.last_identity + len(born),
     )  # fmt: skip
 
 
-def _described(
+def _describe(
     tracker: "ObjectTracker",
     state: TrackerState,
     frame: _Frame,
@@ -369,7 +369,7 @@ def _described(
     """Scores, classes, colours and vectors of the objects, and which are second boxes."""
     detections, matched = frame.detections, renewed.matched
     values = renewed.values(detections.classes, 0), renewed.values(detections.scores, 0.0)
-    lives = state.lives.described(matched, *values)
+    lives = state.lives.describe(matched, *values)
     boxes = boxes_of(state.objects.place)
     overlaps = overlap(boxes, boxes)
     overlaps[~_may_be_one(tracker, lives.classes, lives.classes)] = 0.0

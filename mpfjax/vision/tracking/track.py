@@ -17,15 +17,15 @@ from mpfjax.vision.tracking.adapters import (
     Rows,
     as_detector,
     first_step,
-    observed,
+    observe,
 )
 from mpfjax.vision.tracking.detections import Detections, FrameDetections
 from mpfjax.vision.tracking.gaussian import CameraMotion
 from mpfjax.vision.tracking.kinds import BOXES, Kind
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
 from mpfjax.vision.tracking.state import Tracks
-from mpfjax.vision.tracking.step import advanced
-from mpfjax.vision.tracking.tracker import ObjectTracker, coloured
+from mpfjax.vision.tracking.step import advance
+from mpfjax.vision.tracking.tracker import ObjectTracker, with_colours
 
 _STRONGEST = "; the strongest are kept (here and wherever else it is so)"
 
@@ -112,12 +112,12 @@ def track(
     if camera_motion is None and stills is not None and use_colours and has_opencv():
         camera_motion = "pixels"
     flow = OpticalFlow() if camera_motion == "pixels" else None
-    observations = observed(stills, detector, first, coordinates)
+    observations = observe(stills, detector, first, coordinates)
     times = iter(() if times is None else times)
     inputs = _inputs(
         observations, times, frame_size, min_score, room, use_colours, flow, tracker.kind
     )
-    return _tracked(inputs, tracker, ahead)
+    return _track(inputs, tracker, ahead)
 
 
 class _Inputs(NamedTuple):
@@ -156,7 +156,7 @@ def _inputs(
                 is_warned = True
             trackable = trackable.at(slice(room))
             if use_colours and still is not None and kind.has_boxes:
-                trackable = coloured(trackable, still)
+                trackable = with_colours(trackable, still)
         if flow is not None and still is not None:
             boxes = None
             if trackable is not None and kind.has_boxes:
@@ -165,13 +165,13 @@ def _inputs(
         yield _Inputs(number, trackable, motion, next(times, None))
 
 
-def _tracked(
+def _track(
     inputs: Iterator[_Inputs], tracker: ObjectTracker, ahead: bool
 ) -> Generator[Tracks, None, None]:
     state, is_warned = tracker.init(), False
     with read_ahead(inputs) if ahead else contextlib.nullcontext(inputs) as coming:
         for number, detections, motion, time in coming:
-            state, tracks = advanced(tracker, state, detections, motion, time)
+            state, tracks = advance(tracker, state, detections, motion, time)
             if tracks.full and not is_warned:
                 excess = f"frame {number} has more objects than the {tracker.max_objects}"
                 warn(f"tracker: {excess} of max_objects{_STRONGEST}")
@@ -191,27 +191,28 @@ def online_rows(tracks: Tracks, *, described: bool = False) -> Float[np.ndarray,
     return _rows(tracks, tracks.shown, described)
 
 
+@checked
 def offline_rows(
-    kept: Iterable[Tracks], *, described: bool = False
+    tracks_of_frames: Iterable[Tracks], *, described: bool = False
 ) -> Float[np.ndarray, "r columns"]:
     """Rows of every object that was shown at some time, including its unconfirmed frames.
 
     The columns are those of `online_rows`.
     """
-    kept = list(kept)
-    believed = {0}
-    for tracks in kept:
-        believed |= set(np.asarray(tracks.identities)[np.asarray(tracks.shown)].tolist())
-    chosen = np.array(sorted(believed - {0}))
+    tracks_of_frames = list(tracks_of_frames)
+    identities = {0}
+    for tracks in tracks_of_frames:
+        identities |= set(np.asarray(tracks.identities)[np.asarray(tracks.shown)].tolist())
+    shown = np.array(sorted(identities - {0}))
     rows = [
         _rows(
             tracks,
-            np.isin(tracks.identities, chosen) & (tracks.shown | ~np.asarray(tracks.confirmed)),
+            np.isin(tracks.identities, shown) & (tracks.shown | ~np.asarray(tracks.confirmed)),
             described,
         )
-        for tracks in kept
+        for tracks in tracks_of_frames
     ]
-    coordinates = kept[0].boxes.shape[1] if kept else 4
+    coordinates = tracks_of_frames[0].boxes.shape[1] if tracks_of_frames else 4
     return np.concatenate([np.zeros((0, 2 + coordinates + 2 * described)), *rows])
 
 

@@ -16,7 +16,7 @@ from mpfjax.vision.tracking.lives import Lives
 from mpfjax.vision.tracking.noise import NoiseState
 from mpfjax.vision.tracking.scores import ScoreState
 from mpfjax.vision.tracking.state import TrackerState, Tracks
-from mpfjax.vision.tracking.step import advanced
+from mpfjax.vision.tracking.step import advance
 
 _COLOURS, _BANDS = HSVColours(num_hues=8, num_saturations=4, num_values=6), 3
 
@@ -85,7 +85,7 @@ class ObjectTracker(Checked):
         none, coordinates = np.zeros(0, int), self.kind.coordinates
         return TrackerState(
             objects=Gaussian.none(coordinates),
-            lives=Lives.begun(none, none, at_once=none > 0),
+            lives=Lives.initial(none, none, at_once=none > 0),
             scores=ScoreState.initial(coordinates),
             noise=NoiseState.initial(self.rate, coordinates),
             colours=np.zeros((0, _BANDS * _COLOURS.num_bins)),
@@ -127,11 +127,11 @@ class ObjectTracker(Checked):
             detections = Detections.of(detections, named, kind.coordinates)
             trackable = FrameDetections.of(detections, named, size, kind)
             if frame is not None and kind.has_boxes:
-                trackable = coloured(trackable, frame)
-        return advanced(self, state, trackable, motion, time)
+                trackable = with_colours(trackable, frame)
+        return advance(self, state, trackable, motion, time)
 
 
-def coloured(detections: FrameDetections, frame: UInt8[np.ndarray, "h w 3"]) -> FrameDetections:
+def with_colours(detections: FrameDetections, frame: UInt8[np.ndarray, "h w 3"]) -> FrameDetections:
     """With the colours of the detections, the part of a frame that a step needs."""
     histograms = sampled_histograms(frame, detections.boxes, _COLOURS, _BANDS)
     colours = histograms.reshape(len(histograms), _BANDS * _COLOURS.num_bins)

@@ -32,8 +32,8 @@ class Likeness(NamedTuple):
         number = np.maximum(self.number, 1.0)
         means = self.total / number
         variance = np.mean(np.maximum(self.squares / number - means**2, 0.0)) + _LEAST
-        told = self.number.min() / (self.number.min() + PRIOR)
-        slope = told * max(means[1] - means[0], 0.0) / variance
+        information = self.number.min() / (self.number.min() + PRIOR)
+        slope = information * max(means[1] - means[0], 0.0) / variance
         cost = np.clip(2 * slope * (distances - means.mean()), -_MOST, _MOST)
         return np.where(np.isfinite(distances), cost, 0.0)
 
@@ -48,9 +48,11 @@ class Likeness(NamedTuple):
 
 
 def cosine_distances(
-    known: Float[np.ndarray, "m e"], seen: Float[np.ndarray, "d e"]
+    references: Float[np.ndarray, "m e"], descriptors: Float[np.ndarray, "d e"]
 ) -> Float[np.ndarray, "m d"]:
     """1 - cos of the angle of vectors; NaN where one of them is zero, as where none is known."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        known, seen = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (known, seen))
-    return 1 - known @ seen.T
+        references, descriptors = (
+            each / np.linalg.norm(each, axis=1, keepdims=True) for each in (references, descriptors)
+        )
+    return 1 - references @ descriptors.T

@@ -46,7 +46,7 @@ GAPS = np.where(np.isin(np.arange(STEPS), [0, 5])[:, None], np.nan, SEEN)
 # Carried away after six steps; the alarm rings at once, and the restart is by the next three.
 CARRIED = np.concatenate([SEEN[:6], SEEN[:6] - 12.0])
 PLAIN = mpfjax.mixture_particle_filter(WithDensity(), 100, 3)
-START = mpfjax.with_start(PLAIN, LENGTH)
+START = mpfjax.with_initialisation(PLAIN, LENGTH)
 restarts = partial(mpfjax.with_restarts, probability=PROBABILITY, num_observations=LENGTH)
 FILTER = restarts(START)
 
@@ -89,7 +89,7 @@ def test_a_checkpoint_within_the_window_goes_on_to_the_bit(tmp_path):
 @pytest.mark.exactness
 def test_inputs_of_each_step_are_those_of_the_window():
     """As a field of the model, and as matrices of each step."""
-    filter = mpfjax.with_start(mpfjax.particle_filter(Driven(), 100), LENGTH)
+    filter = mpfjax.with_initialisation(mpfjax.particle_filter(Driven(), 100), LENGTH)
     series = mpfjax.Series(OBSERVATIONS, INPUTS)
     log_z, filtered, _ = truth()
     runs = mpfjax.monte_carlo(jax.random.split(KEY, 300), filter, series, mean)
@@ -105,7 +105,7 @@ def test_matrices_of_each_step_are_those_of_the_window():
     model = mpfjax.LinearGaussianModel(one, 0.1 * one, one, 0.1 * one, np.zeros(1), 4 * one)
     matrices = {"A": np.array([0.5, 1.5, 0.7, 1.2], np.float32)[:, None, None]}
     series = mpfjax.Series(np.array([[0.6], [1.0], [0.3], [0.8]], np.float32), matrices)
-    filter = mpfjax.with_start(mpfjax.particle_filter(model, 100), LENGTH)
+    filter = mpfjax.with_initialisation(mpfjax.particle_filter(model, 100), LENGTH)
     runs = mpfjax.monte_carlo(jax.random.split(KEY, 300), filter, series, mean)
     assert_unbiased(ratios_to(kalman_filter(model, series), runs), loosest=0.05)
 
@@ -133,9 +133,9 @@ def test_evidence_and_moments_are_those_of_a_state_that_began_anew(islands):
         runs = mpfjax.monte_carlo(keys, FILTER, CARRIED, mean)
     else:
         runs = jax.jit(jax.vmap(run))(keys)
-    surprised = np.asarray(runs.surprised)
-    assert surprised[:, 6:8].all()
-    assert not surprised[:, 8:].any()
+    alarm = np.asarray(runs.alarm)
+    assert alarm[:, 6:8].all()
+    assert not alarm[:, 8:].any()
     ratios = ratios_to(log_evidence_with_a_restart(CARRIED, 6), runs)
     assert_unbiased(ratios, 1.0, loosest=0.05, errors=3.0)
     if islands == 1:
@@ -159,7 +159,7 @@ class Offset(WithDensity):
 @pytest.mark.parametrize("change", [{"constant": -2e4}, {"reach": 10.0}], ids=["offset", "reach"])
 def test_restarts_where_log_likelihoods_are_large_or_minus_infinity(change):
     plain = mpfjax.mixture_particle_filter(Offset(**change), 200, 3)
-    filter = restarts(mpfjax.with_alarm(mpfjax.with_start(plain, LENGTH), 1000))
+    filter = restarts(mpfjax.with_alarm(mpfjax.with_initialisation(plain, LENGTH), 1000))
     runs = mpfjax.monte_carlo(jax.random.split(KEY, 100), filter, CARRIED, mean)
     constants = change.get("constant", 0.0) * len(CARRIED)
     increments = np.asarray(runs.log_likelihood_increments, float)
@@ -173,10 +173,10 @@ def test_restarts_where_log_likelihoods_are_large_or_minus_infinity(change):
 
 def test_smoothing_refuses_a_run_in_which_a_state_began_anew():
     for plain in (PLAIN, mpfjax.gaussian_particle_filter(WithDensity(), 100)):
-        filter = mpfjax.with_start(plain, LENGTH)
+        filter = mpfjax.with_initialisation(plain, LENGTH)
         run = mpfjax.run_filter(KEY, filter, SEEN)
         with pytest.raises(ValueError, match="began anew"):
-            sample_trajectories(KEY, WithDensity(), run, 5)
+            sample_trajectories(KEY, filter, run, 5)
     with pytest.raises(ValueError, match="one parent"):
         mpfjax.with_eve_indices(START)
     with pytest.raises(ValueError, match="cannot keep a trajectory"):
@@ -195,14 +195,14 @@ def test_derivatives_are_refused():
         filter = filter.replace(model=model)
         return mpfjax.run_filter(KEY, filter, SEEN[:3], mean).log_marginal_likelihood
 
-    filter = mpfjax.with_start(mpfjax.particle_filter(PLANE, 20), LENGTH)
+    filter = mpfjax.with_initialisation(mpfjax.particle_filter(PLANE, 20), LENGTH)
     with pytest.raises(ValueError, match="no derivatives"):
         score(PLANE, filter)
     assert any(move.biases_score for move in filter.moves)
 
 
 def test_a_start_and_restarts_are_one_whichever_comes_first():
-    both = restarts(START), mpfjax.with_start(restarts(PLAIN), LENGTH)
+    both = restarts(START), mpfjax.with_initialisation(restarts(PLAIN), LENGTH)
     assert eqx.tree_equal(*both)
     assert sum(isinstance(move, Restart) for move in both[0].moves) == 1
     alarms = mpfjax.with_alarm(FILTER, 30), restarts(mpfjax.with_alarm(START, 30))
@@ -211,16 +211,18 @@ def test_a_start_and_restarts_are_one_whichever_comes_first():
 
 def test_what_cannot_begin_so_is_refused():
     with pytest.raises(ValueError, match="need every slot"):
-        mpfjax.monte_carlo(jax.random.split(KEY, 2), START, SEEN, mean, slots=120)
+        mpfjax.monte_carlo(jax.random.split(KEY, 2), START, SEEN, mean, num_slots=120)
     with pytest.raises(ValueError, match="first observations already"):
-        mpfjax.with_start(START)
+        mpfjax.with_initialisation(START)
     with pytest.raises(ValueError, match="more observations than y_1"):
-        mpfjax.with_selected_start(START)
+        mpfjax.with_initial_selection(START)
     with pytest.raises(ValueError, match="defines no log_initial"):
-        mpfjax.with_start(mpfjax.particle_filter(Batched(), 50))
+        mpfjax.with_initialisation(mpfjax.particle_filter(Batched(), 50))
     with pytest.raises(ValueError, match="num_particles: 40, of which 2 may be all of the slots"):
         mpfjax.with_restarts(mpfjax.mixture_particle_filter(WithKeys(), 40, 12))
-    with pytest.raises(ValueError, match="2 steps, fewer than num_observations of with_start, 3"):
+    with pytest.raises(
+        ValueError, match="2 steps, fewer than num_observations of with_initialisation, 3"
+    ):
         mpfjax.run_filter(KEY, START, SEEN[:2], mean)
 
 
@@ -233,10 +235,10 @@ def test_an_impossible_step_does_not_turn_the_alarm_off_for_ever():
     """It counts as much as one step can, and the alarm ends when all is right again."""
     filter = mpfjax.with_alarm(mpfjax.particle_filter(Bounded(), 200))
     told = np.array([0.0, 50.0, 0.0, 0.0, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 0.0], np.float32)
-    surprised = np.asarray(mpfjax.run_filter(jax.random.key(0), filter, told).surprised)
-    assert not surprised[[0, 2, 3]].any()
-    assert surprised[6]
-    assert not surprised[-1]
+    alarm = np.asarray(mpfjax.run_filter(jax.random.key(0), filter, told).alarm)
+    assert not alarm[[0, 2, 3]].any()
+    assert alarm[6]
+    assert not alarm[-1]
 
 
 class Bounded(ScalarLinear):
@@ -294,10 +296,10 @@ def told():
 @pytest.mark.parametrize("name", ["alarm", "restarts"])
 def test_an_alarm_is_given_where_all_hypotheses_are_wrong(name, told):
     (run, messages), (calm, silence) = told[name, True], told[name, False]
-    surprised = np.asarray(run.surprised)
-    assert surprised[:, 20:23].any(axis=1).all()
-    assert not surprised[:, :20].any()
-    assert not np.asarray(calm.surprised).any()
+    alarm = np.asarray(run.alarm)
+    assert alarm[:, 20:23].any(axis=1).all()
+    assert not alarm[:, :20].any()
+    assert not np.asarray(calm.alarm).any()
     said = [each for each in messages if "speaks against all hypotheses in 8 of 8 runs" in each]
     assert len(said) == (name == "alarm")
     assert not silence
@@ -307,7 +309,7 @@ def test_an_alarm_is_given_where_all_hypotheses_are_wrong(name, told):
 def test_after_a_restart_the_state_is_found_and_the_alarm_ends(told):
     run, _ = told["restarts", True]
     np.testing.assert_allclose(jax.vmap(lambda m: m.mean())(run.final), 11.0, atol=0.5)
-    assert not np.asarray(run.surprised)[:, -1].any()
+    assert not np.asarray(run.alarm)[:, -1].any()
 
 
 def test_the_evidence_is_that_of_the_prior_beside_the_increment(told):

@@ -169,4 +169,4 @@ def test_a_model_whose_x_0_cannot_be_moved_is_refused():
     with pytest.raises(ValueError, match=r"Whole has int32 in x_0"):
         check_initial_density(Whole(), "a start")
     with pytest.raises(ValueError, match=r"is conditionally linear"):
-        mpfjax.with_start(mpfjax.particle_filter(CONDITIONALLY_LINEAR, 50))
+        mpfjax.with_initialisation(mpfjax.particle_filter(CONDITIONALLY_LINEAR, 50))
