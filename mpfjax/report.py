@@ -20,8 +20,6 @@ class StepInfo(eqx.Module):
     - `resampled`: which components of the previous mixture were resampled.
     - `degenerate`: whether every particle had zero likelihood: the weights are then those of the
       prediction.
-    - `broken`: whether the increment is NaN or +inf, because a density of the model is, or because
-      an observation has NaN. Within a caller's `jax.jit` nothing can be raised: check it outside.
     - `labels_ran_out`: whether all M > 1 labels are in use, so that further modes share one; see
       `Split.is_diffuse`.
     - `log_marginal_likelihood_error`: the standard error of log Ẑ of all steps so far, from this
@@ -30,8 +28,8 @@ class StepInfo(eqx.Module):
     - `log_evidence_against_start`: log of p(y_t | x_{t-1} ~ p_0) over p(y_t | y_1..y_{t-1}): the
       evidence of y_t for a state that restarts from the prior, against the filter's hypotheses;
       None unless a move computes it, as in `with_alarm` and `with_restarts`.
-    - `alarm`: whether all hypotheses seem wrong: the cumulative sum of that evidence is above
-      5, see `FilterRun.alarm`; None as above.
+    - `alarm`: whether all hypotheses seem wrong: the cumulative sum of that evidence is above 5,
+      see `FilterRun.alarm`; None as above.
     """
 
     log_likelihood_increment: Float[Array, ""]

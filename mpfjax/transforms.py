@@ -204,7 +204,7 @@ def with_restarts(
 
     The alarm is the one of `with_alarm`, with N draws if there is none yet. If its cumulative sum
     has been positive for L steps or more, a sample of p(x_t | the last L observations) is added to
-    the hypotheses, weighted by its evidence and p. This step takes as long as that of
+    the hypotheses, weighted by its evidence and p. This step takes as long as the initialisation by
     `with_initialisation`. A state that restarts is recovered L steps later at the earliest.
     `Restart` describes the model for which Ẑ is unbiased. For a filter with restarts, its settings
     are changed. Raises `ValueError` for a model that `with_initialisation` refuses. Use it if all

@@ -1,4 +1,4 @@
-"""An object among clutter: measurements of which at most one is its own."""
+"""An object in clutter: sets of measurements of which at most one is caused by the object."""
 
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -40,32 +40,34 @@ def number_or_function(name: str) -> Callable[[Any], Any]:
 
 
 class ClutteredModel(AbstractStateSpaceModel, Fitting):
-    """An object that a sensor may miss, and clutter beside it: a radar's plots, say.
+    """An object that a sensor may miss, in clutter, such as the plots of a radar.
 
     y_t is a set of measurements y_1, ..., y_k. With probability p_D the object is detected, and one
-    of them is its own, of density N(y | x) by `object_model`. The others are a Poisson process of
-    density λ(y). Summed over all associations, as in the filter of Bar-Shalom and Tse (1975),
+    of the measurements is caused by it, with density N(y | x) by `object_model`. The others are a
+    Poisson process of density λ(y). Summed over all associations, as in the filter of Bar-Shalom
+    and Tse (1975),
 
         L(y_1, ..., y_k | x) = (1 - p_D) + p_D Σ_j N(y_j | x) / λ(y_j).
 
-    This is the density of the set over that of the same set as clutter alone, exp(-∫λ) Π_j λ(y_j),
-    which says nothing of x. So log Ẑ estimates the log odds of an object against clutter alone;
-    log p(y_1..y_t) is Σ_t (Σ_j log λ(y_j) - ∫λ) more, which counts where λ is a parameter.
+    This is the density of the set over its density as clutter alone, exp(-∫λ) Π_j λ(y_j), which
+    does not depend on x. So log Ẑ estimates the log odds of an object against clutter alone; log
+    p(y_1..y_t) is larger by Σ_t (Σ_j log λ(y_j) - ∫λ), which matters if λ is a parameter.
 
-    - `object_model`: its `log_likelihood`, of one measurement, must be log of a normalised density
-      of y; a constant left out would count as clutter.
-    - `detection_probability`: p_D, a number in [0, 1], or a function of the states, (n,), as where
-      a sensor sees only so far.
-    - `clutter_density`: λ, how many false measurements to expect in a step in a unit of the
-      measurements' space. A positive number, or a function of one measurement.
+    - `object_model`: its `log_likelihood`, of one measurement, must be the log of a normalised
+      density of y; an omitted constant would count as clutter.
+    - `detection_probability`: p_D, a number in [0, 1], or a function of the states, (n,), for a
+      sensor with a limited field of view.
+    - `clutter_density`: λ, the expected number of false measurements per step and unit of the
+      measurement space. A positive number, or a function of one measurement.
 
-    Each observation has room for K measurements, leaves (K, ...): rows with a NaN are none, and a
-    step without any says that the object was missed. A step in which the sensor was off is one that
-    is missing, see `Series`. The object's model gives everything else, but for what is about a
-    single measurement: there is no `observation_mean`, and so no `GaussNewtonProposal`. Raises
-    `ValueError` for numbers outside of these, and for a conditionally linear model: draw regimes
-    with the state, and `GroupBy` them. Use it for one object among false alarms. Two objects would
-    claim the same measurement; for several take `TargetsModel`.
+    Each observation has room for K measurements, leaves (K, ...): rows with a NaN are not
+    measurements, and a step without any means that the object was missed. A step in which the
+    sensor was off is a missing one, see `Series`. All other properties are those of the object
+    model, except for what concerns a single measurement: there is no `observation_mean`, and so no
+    `GaussNewtonProposal`. Raises `ValueError` for numbers outside these ranges, and for a
+    conditionally linear model: sample regimes with the state, and `GroupBy` them. Use it for one
+    object with false alarms. Two objects would claim the same measurement; for several objects use
+    `TargetsModel`.
     """
 
     object_model: AbstractStateSpaceModel
@@ -84,7 +86,7 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
         refuse_marginalised(self.object_model, "ClutteredModel", instead, name)
 
     def with_inputs(self, inputs: PyTree) -> "ClutteredModel":
-        """The model whose object has u_t."""
+        """The model whose object has the inputs u_t."""
         return replace_fields(self, object_model=with_inputs(self.object_model, inputs))
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
@@ -96,7 +98,7 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
         return self.object_model.sample_transition(key, states)
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
-        """log L of the measurements, over that of clutter alone."""
+        """log L of the measurements, relative to clutter alone."""
         odds, p = self.log_odds(observation, states), self.detection(states)
         # Chances of 0 and 1 have no logarithm, but the likelihood has a derivative there.
         largest = jax.lax.stop_gradient(jnp.maximum(jnp.max(odds, axis=1, initial=0.0), 0.0))
@@ -105,7 +107,7 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
         return largest + log_or_nothing(missed + detected)
 
     def log_odds(self, observation: PyTree, states: PyTree) -> Float[Array, "n k"]:
-        """log N(y_j | x) / λ(y_j) of each state and each measurement, -inf for a row of none."""
+        """log N(y_j | x) / λ(y_j) of each state and each measurement, -inf for an empty row."""
         density = self.clutter_density
 
         def of_one(measurement: PyTree) -> Float[Array, " n"]:

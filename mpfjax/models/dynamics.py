@@ -1,6 +1,4 @@
-"""The dynamics of a vector from frame to frame: random walks, with long steps or with a velocity,
-and second-order autoregression.
-"""
+"""Dynamics of a vector: random walks, with jumps or a velocity, and second-order autoregression."""
 
 import abc
 from typing import Annotated, Any
@@ -33,10 +31,10 @@ Deviations = Annotated[Float[Array, "*n d"], POSITIVE]
 class AbstractDynamics(Fitting):
     """D(x_t | x_{t-1}, x_{t-2}) of a vector: a part of a model, not a model itself.
 
-    A class defines the `expected` x_t and the law of the step that x_t takes from there. There is
-    one set of parameters for all particles, or one for each, along a leading axis. If `order`, how
-    many past values x_t depends on, is 2, a model keeps the past of x_t in its state too: x_{t-1},
-    or the value of `remembered`, which is then `previous` in the next step.
+    A class defines the `expected` x_t and the distribution of the step from there to x_t. There is
+    one set of parameters for all particles, or one for each, along a leading axis. If `order`, the
+    number of past values on which x_t depends, is 2, the state of a model also contains the past of
+    x_t: x_{t-1}, or the value of `remembered`, which is then `previous` in the next step.
     """
 
     order = 1
@@ -48,34 +46,34 @@ class AbstractDynamics(Fitting):
 
     @property
     def noise_dimension(self) -> int:
-        """k, how many standard normal numbers x_t is made of."""
+        """k, the number of standard normal numbers from which x_t is computed."""
         return self.shape[-1]
 
     @property
     @abc.abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """(d,), or (n, d) where each particle has parameters of its own."""
+        """(d,), or (n, d) if each particle has its own parameters."""
 
     @abc.abstractmethod
     def expected(self, current: Rows, previous: Rows | None) -> Rows:
-        """The place that x_t steps from, given x_{t-1}, and x_{t-2} where the order is 2."""
+        """The value from which x_t steps, given x_{t-1}, and x_{t-2} if the order is 2."""
 
     @abc.abstractmethod
     def step(self, noise: Float[Array, "n k"]) -> Rows:
-        """The step of each row, made of standard normal noise."""
+        """The step of each row, a function of standard normal noise."""
 
     @abc.abstractmethod
     def log_step(self, steps: Rows) -> Float[Array, " n"]:
         """The log-density of a step."""
 
     def sample_step(self, key: Key[Array, ""], num_rows: int, dtype: jnp.dtype) -> Rows:
-        """Steps of fresh noise."""
+        """Steps from new noise."""
         return self.step(normal(key, (num_rows, self.noise_dimension), dtype))
 
     def from_noise(
         self, noise: Float[Array, "n k"], current: Rows, previous: Rows | None = None
     ) -> Rows:
-        """x_t given x_{t-1}, and x_{t-2} where the order is 2, made of standard normal noise."""
+        """x_t given x_{t-1}, and x_{t-2} if the order is 2, from standard normal noise."""
         return self.expected(current, previous) + self.step(noise)
 
     def sample(self, key: Key[Array, ""], current: Rows, previous: Rows | None = None) -> Rows:
@@ -127,18 +125,19 @@ class RandomWalk(AbstractDynamics):
 
 
 class RandomWalkWithJumps(RandomWalk):
-    """x_t = x_{t-1} + diag(s) ω_t, ω_t ~ N(0, I); s is long with a small probability.
+    """x_t = x_{t-1} + diag(s) ω_t, ω_t ~ N(0, I), where s is large with a small probability.
 
-    The contaminated normal of Tukey (1960) as dynamics: (1 - p) N(x_{t-1}, diag(deviations²))
-    + p N(x_{t-1}, diag(jump_deviations²)). A few particles jump. They find an object again that
-    was hidden for some frames, or that the filter lost to a look-alike. The recursion stays exact.
+    The contaminated normal distribution of Tukey (1960) as dynamics: (1 - p) N(x_{t-1},
+    diag(deviations²)) + p N(x_{t-1}, diag(jump_deviations²)). A few particles jump, and recover an
+    object that was hidden for some frames, or that the filter lost to a similar object. The
+    recursion remains exact.
 
     - `deviations`, `jump_deviations`: standard deviations of an ordinary and of a long step, (d,),
       or (n, d) with a row for each particle, in units of the state per frame.
     - `jump_probability`: p.
 
     Raises `ValueError` for a deviation that is not positive, for deviations of different shapes,
-    and for a probability outside (0, 1). Use it where objects vanish and come back elsewhere.
+    and for a probability outside (0, 1). Use it if objects disappear and reappear elsewhere.
     """
 
     jump_deviations: Deviations = eqx.field(converter=to_array("jump_deviations"))
@@ -155,7 +154,7 @@ class RandomWalkWithJumps(RandomWalk):
         return self._step(jumps, noise[:, :-1])
 
     def sample_step(self, key: Key[Array, ""], num_rows: int, dtype: jnp.dtype) -> Rows:
-        """Steps drawn with separate keys for the jumps and for the noise."""
+        """Steps whose lengths and directions are drawn from separate keys."""
         key_noise, key_jump = split_once(key, 2)
         # In one row, which is drawn fast; the numbers are those of n rows.
         jumps = jax.random.bernoulli(fast_key(key_jump), self.jump_probability, (num_rows,))
@@ -179,21 +178,21 @@ class WalkWithVelocity(AbstractDynamics):
     """x_t = x_{t-1} + v_{t-1} + e_t and v_t = v_{t-1} + gain · e_t, with e_t a step of `walk`.
 
     The local linear trend in innovations form: Holt's smoothing as a model (Hyndman, Koehler, Ord
-    and Snyder 2008, chapter 3, with α = 1). v is the mean that a Kalman filter in its steady state
-    has of a velocity that is itself a random walk, so that a particle carries its velocity without
-    drawing it. With a gain of 0, v never changes; with 1, it is the last displacement.
+    and Snyder 2008, chapter 3, with α = 1). v is the steady-state Kalman mean of a velocity that is
+    itself a random walk, so that a particle carries its velocity without sampling it. With a gain
+    of 0, v never changes; with 1, it is the last displacement.
 
-    A model that keeps the past keeps x_t - v_t: where x_{t-1} was, had it moved at this velocity
-    (`remembered`).
+    A model that stores the past stores x_t - v_t: the position of x_{t-1} if it had moved at this
+    velocity (`remembered`).
 
     - `walk`: the noise of x_t, a `RandomWalk` or `RandomWalkWithJumps`.
-    - `gain`: in [0, 1], a number or one a coordinate. v averages over about 1 / gain steps.
-    - `initial_velocity`: deviations of v_0 about 0, of the shape of the walk's deviations, in units
-      of the state a frame; None takes 0.
+    - `gain`: in [0, 1], a number or one per coordinate. v averages over about 1 / gain steps.
+    - `initial_velocity`: standard deviations of v_0 about 0, in the shape of the walk's deviations,
+      in units of the state per frame; None is 0.
 
-    Raises `ValueError` for a gain outside [0, 1] and a negative deviation.
-    Use it where objects keep their velocity: look-alikes that cross keep their identities, and a
-    hidden object moves on.
+    Raises `ValueError` for a gain outside [0, 1] and a negative deviation. Use it if objects keep
+    their velocity: similar objects that cross retain their identities, and a hidden object moves
+    on.
     """
 
     order = 2
@@ -208,7 +207,7 @@ class WalkWithVelocity(AbstractDynamics):
 
     @property
     def noise_dimension(self) -> int:
-        """The number of coordinates of the walk's noise."""
+        """The noise dimension of the walk."""
         return self.walk.noise_dimension
 
     @property
@@ -225,7 +224,7 @@ class WalkWithVelocity(AbstractDynamics):
         return self.walk.step(noise)
 
     def log_step(self, steps: Rows) -> Float[Array, " n"]:
-        """The log density of the walk's steps."""
+        """The log-density of a step of the walk."""
         return self.walk.log_step(steps)
 
     def sample_step(self, key: Key[Array, ""], num_rows: int, dtype: jnp.dtype) -> Rows:
@@ -249,14 +248,14 @@ class WalkWithVelocity(AbstractDynamics):
 class Autoregression(AbstractDynamics):
     """x_t - x̄ = A1 (x_{t-1} - x̄) + A2 (x_{t-2} - x̄) + B ω_t, ω_t ~ N(0, I).
 
-    Lin et al. (2012), eq. 4. The state returns to x̄. With A1 + A2 = I, as in `with_momentum`, x̄
-    cancels, and the state returns nowhere.
+    Lin et al. (2012), eq. 4. The state reverts to x̄. With A1 + A2 = I, as in `with_momentum`, x̄
+    cancels, and the state does not revert.
 
-    - `A1`, `A2`, `B`: (d, d); `mean`: x̄, (d,); or each with a leading axis, a set for each
-      particle. `log_density` needs an invertible B.
+    - `A1`, `A2`, `B`: (d, d); `mean`: x̄, (d,); or each with a leading axis, one set for each
+      particle. `log_density` requires an invertible B.
 
-    Raises `ValueError` for shapes that do not fit together. Use it for objects whose speed and
-    direction last over several frames.
+    Raises `ValueError` for shapes that do not agree. Use it for objects whose speed and direction
+    persist over several frames.
     """
 
     order = 2
@@ -270,7 +269,7 @@ class Autoregression(AbstractDynamics):
     def with_momentum(cls, momentum: float, deviations: Float[Array, "*n d"]) -> "Autoregression":
         """x_t = x_{t-1} + momentum (x_{t-1} - x_{t-2}) + diag(deviations) ω_t.
 
-        Momentum 1 is constant velocity, 0 the random walk; Smith and Gatica-Perez (2004) have 0.5.
+        Momentum 1 is constant velocity, 0 the random walk; Smith and Gatica-Perez (2004) use 0.5.
         `deviations` are one row for all, or a row for each particle or box, as in `RandomWalk`.
         """
         momentum = to_array("momentum")(momentum)

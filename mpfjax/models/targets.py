@@ -1,4 +1,4 @@
-"""Objects that come and go, seen by sensors that miss some and report others that are not there."""
+"""Objects that appear and disappear, observed by sensors with missed detections and clutter."""
 
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -28,23 +28,24 @@ def _as_sensors(sensors: Any) -> tuple[Any, ...]:
 
 
 class TargetsModel(AbstractStateSpaceModel, Fitting):
-    """An unknown number of objects that appear, move, disappear, and are seen among clutter.
+    """An unknown number of objects that appear, move, disappear, and are detected among clutter.
 
-    In a step each object survives with probability p_S(x_t), and moves by the object model; new
-    ones appear as a Poisson process. Each sensor then detects each object with probability p_D(x),
-    and reports one measurement of it, among clutter (the model of Mahler 2003, and of Williams
-    2015). A state is that of one object. `bernoulli_filter` keeps a component for each.
+    In each step an object survives with probability p_S(x_t), and moves by the object model; new
+    objects appear as a Poisson process. Each sensor then detects each object with probability
+    p_D(x), and reports one measurement of it, among clutter (the model of Mahler 2003, and of
+    Williams 2015). A state is the state of one object. `bernoulli_filter` has a component for each.
 
     - `sensors`: a `ClutteredModel`, of one object's motion, one measurement of it, p_D and the
-      clutter; or several, used in turn, of which the first has the motion.
+      clutter; or several, used in turn, of which the first defines the motion.
     - `birth`: the new objects of a step, a `UniformBirth` or another `AbstractBirth`.
     - `survival_probability`: p_S, a number in [0, 1], or a function of the states, (n,).
-    - `initial_number`: how many objects to expect at t = 0, like new ones.
+    - `initial_number`: the expected number of objects at t = 0, with states of the birth model.
 
-    An observation is what `ClutteredModel` takes, K rows of which those with a NaN are none; with
-    several sensors a tuple of these. A scan without any says that every object was missed; one
-    with the sensor off is missing, see `Series`. log L(y_t | x) is that of x as the only object.
-    Raises `ValueError` for numbers outside of these and other sensors.
+    An observation is the same as for `ClutteredModel`, K rows of which those with a NaN are not
+    measurements; with several sensors it is a tuple of these. A scan without measurements means
+    that every object was missed; a scan with the sensor off is a missing one, see `Series`. log
+    L(y_t | x) assumes that x is the only object. Raises `ValueError` for numbers outside these
+    ranges and other sensors.
     """
 
     sensors: tuple[ClutteredModel, ...] = eqx.field(converter=_as_sensors)
@@ -59,7 +60,7 @@ class TargetsModel(AbstractStateSpaceModel, Fitting):
     handles_missing = True
 
     def with_inputs(self, inputs: PyTree) -> "TargetsModel":
-        """The model whose objects have u_t."""
+        """The model whose objects have the inputs u_t."""
         return replace_fields(
             self, sensors=tuple(with_inputs(each, inputs) for each in self.sensors)
         )
@@ -82,7 +83,7 @@ class TargetsModel(AbstractStateSpaceModel, Fitting):
         return self.sensors[0].sample_transition(key, states)
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
-        """log L of the measurements over that of clutter alone, with x as the only object."""
+        """log L of the measurements relative to clutter alone, with x as the only object."""
         scans = zip(self.sensors, self.scans(observation), strict=True)
         return total([sensor.log_likelihood(scan, states) for sensor, scan in scans])
 

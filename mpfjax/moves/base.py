@@ -22,7 +22,7 @@ Gradient = Literal["none", "stop"]
 
 
 class Step(eqx.Module):
-    """What a move is given of the step that it takes part in: `move(key, mixture, now)`."""
+    """The step that a move is part of, the argument `now` of `move(key, mixture, now)`."""
 
     model: Any
     """the filter's own model, an `AbstractStateSpaceModel` at u_t."""
@@ -48,7 +48,7 @@ class Step(eqx.Module):
 
     @property
     def propagation(self) -> "AbstractPropagationOfEach | None":
-        """The move by which the filter draws and weighs x_t of one particle; None without one."""
+        """The filter's move that draws and weights x_t of each particle; None if it has none."""
         return propagation_of(self.moves)
 
     @property
@@ -58,7 +58,7 @@ class Step(eqx.Module):
 
     @property
     def initial_law(self) -> Law:
-        """The law of the model without inputs, which x_0 has none of."""
+        """The law of the model without inputs, because x_0 has no input."""
         return law_of(self.model if self.initial_model is None else self.initial_model)
 
 
@@ -74,13 +74,13 @@ class Given(Checked):
 
 
 class AbstractMove(Given):
-    """A step of a filter, `(key, mixture, now) -> mixture`, where `now` is a `Step`.
+    """A move of a filter, `(key, mixture, now) -> mixture`, where `now` is a `Step`.
 
-    The kind of a move is its contract. An `AbstractRegrouping` does not change the distribution.
-    An `AbstractResampling` does not change the mass of any component. An `AbstractPropagation`
-    takes the particles from t-1 to t. An `AbstractMarkovMove` moves x_t by a kernel that leaves
-    its distribution invariant. An `AbstractWrapper` holds other moves. What the kind does not say,
-    the move says in the attributes and methods below.
+    The kind of a move is its contract. An `AbstractRegrouping` does not change the distribution. An
+    `AbstractResampling` does not change the weight of any component. An `AbstractPropagation` takes
+    the particles from t-1 to t. An `AbstractMarkovMove` moves x_t by a kernel that leaves its
+    distribution invariant. An `AbstractWrapper` contains other moves. Properties that do not follow
+    from the kind are declared by the attributes and methods below.
     """
 
     approximate = True
@@ -110,23 +110,23 @@ class AbstractMove(Given):
         """Move the mixture at this step."""
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
-        """Raise a `ValueError` for a model or numbers of a filter that it cannot work with."""
+        """Raise a `ValueError` for a model or numbers of a filter that are not supported."""
 
     def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
         """The memory of the move at x_0, under its own name; most moves have none.
 
-        `now` has the model, and y_1 and u_1 where they are known, though y_1 may be missing there.
+        `now` contains the model, and y_1 and u_1 if they are known; y_1 may be missing.
         """
         return {}
 
     def around(self, reference: Any) -> "AbstractMove":
-        """The move in conditional SMC, which keeps one trajectory, a `Reference`; most cannot."""
+        """The move in conditional SMC, which retains one trajectory, a `Reference`; most refuse."""
         who = f"filter: {type(self).__name__}"
         raise ValueError(f"{who} cannot keep a trajectory, as Resample and Propagate can")
 
     @property
     def inner(self) -> "Moves":
-        """The moves that it runs."""
+        """The moves that this move runs."""
         moves: Moves = ()
         for name in self.holds:
             part = getattr(self, name)
@@ -134,7 +134,7 @@ class AbstractMove(Given):
         return moves
 
     def map_inner(self, change: Callable[[Any], Any]) -> Any:
-        """The move with `change(move)` in the place of each move that it runs."""
+        """The move in which `change(move)` replaces each move that it runs."""
         if not self.holds:
             return self
         parts = {}
@@ -213,10 +213,10 @@ Regrouped = tuple[Int[Array, " n"], dict[str, PyTree]]
 
 
 class AbstractRegrouping(AbstractMove):
-    """A move that rewrites the component indicators and nothing else, so that it is exact.
+    """A move that changes the component indicators and nothing else, and is therefore exact.
 
     This is the reclustering F of Vermaak et al. (2003), section 4. With joint weights, the new
-    mixture has the same distribution as the old one, whatever the new indicators are.
+    mixture represents the same distribution as the old one, for any new indicators.
     """
 
     approximate = False
@@ -246,14 +246,14 @@ class AbstractRegrouping(AbstractMove):
         return regrouped.broken_where(mixture.occupied & (inside != indicators))
 
     def around(self, reference: Any) -> "AbstractRegrouping":
-        """The move itself, for which all particles are alike."""
+        """The move itself, which treats all particles alike."""
         return self
 
 
 class AbstractResampling(AbstractMove):
-    """A move that redraws the particles of each component and keeps the component's mass.
+    """A move that redraws the particles of each component and preserves the component's weight.
 
-    Resampling makes copies and is unbiased. Gaussian regeneration draws from a fitted density
+    Resampling copies particles and is unbiased. Gaussian regeneration draws from a fitted density
     instead, and is `approximate`.
     """
 
@@ -287,10 +287,10 @@ def unless_waiting(resampled: ParticleMixture, mixture: ParticleMixture) -> Part
 
 
 class AbstractMarkovMove(AbstractMove):
-    """A move by a Markov kernel that leaves the distribution of each particle's x_t as it is.
+    """A move by a Markov kernel that leaves the distribution of each particle's x_t invariant.
 
-    The "move" of resample-move (Gilks and Berzuini 2001), called rejuvenation in the literature.
-    Weights, component indicators and ancestor indices stay, so that it is exact.
+    The "move" of resample-move (Gilks and Berzuini 2001), also called rejuvenation. Weights,
+    component indicators and ancestor indices do not change, so it is exact.
     """
 
     approximate = False
@@ -300,10 +300,10 @@ class AbstractMarkovMove(AbstractMove):
 
 
 class AbstractPropagation(AbstractMove):
-    """A move that draws x_t and multiplies the weights by L D / q, so that the mass changes.
+    """A move that draws x_t and multiplies the weights by L D / q, which changes the total weight.
 
-    Without an observation it draws x_t by the model's own law and leaves the weights. Moves that it
-    holds work within it.
+    Without an observation it draws x_t by the model's transition and leaves the weights unchanged.
+    Moves that it contains act inside it.
     """
 
     weighs = True
@@ -314,10 +314,10 @@ class AbstractPropagation(AbstractMove):
 
 
 class AbstractPropagationOfEach(AbstractPropagation):
-    """A propagation that draws and weighs x_t of each particle without a look at the others.
+    """A propagation that draws and weights x_t of each particle independently of the others.
 
-    So it may be asked for several draws of each, or for those of other particles: a filter's first
-    one is `now.propagation` for all its moves.
+    It can therefore draw several x_t for each particle, or propagate other particles: the first one
+    of a filter is `now.propagation` for all its moves.
     """
 
 
@@ -331,9 +331,9 @@ def _of_inner(together: Callable[..., bool], name: str) -> Any:
 
 
 class AbstractWrapper(AbstractMove):
-    """A move that holds moves; what it does not define itself is as they have it.
+    """A move that contains other moves, and forwards everything that it does not define itself.
 
-    The class names the fields that hold them: `holds = ("moves",)`, each a move or a tuple of
+    The class names the fields that contain them: `holds = ("moves",)`, each a move or a tuple of
     moves. Transforms of filters reach all moves by these names.
     """
 
@@ -346,24 +346,24 @@ class AbstractWrapper(AbstractMove):
     biases_score = _of_inner(any, "biases_score")
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
-        """The checks of the moves."""
+        """The checks of the inner moves."""
         for move in self.inner:
             move.check(now, num_particles, num_components)
 
     def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
-        """The memory of the moves."""
+        """The memory of the inner moves."""
         return memory_of(self.inner, now, num_components)
 
     def around(self, reference: Any) -> Any:
-        """The move, with the moves that it runs around the trajectory."""
+        """This move with its inner moves conditional on the trajectory."""
         return self.map_inner(lambda move: move.around(reference))
 
 
 class AbstractProposal(Given):
-    """A way to draw x_t given x_{t-1} and y_t, with the density of each draw."""
+    """A proposal distribution of x_t given x_{t-1} and y_t, with the density of each draw."""
 
     def check(self, now: Step) -> None:
-        """Raise a `ValueError` for a model that the proposal is not for; most are for any."""
+        """Raise a `ValueError` for a model that the proposal does not support; most support any."""
 
     @abc.abstractmethod
     def propose(
@@ -371,12 +371,12 @@ class AbstractProposal(Given):
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """x_t ~ q(. | x_{t-1}, y_t) for every particle, and log q of each, shape (n,).
 
-        `now` has the model, y_t and u_t. A proposal may also have
-        `log_density(now, states, previous_states)`, log q of
-        states that were not drawn from it, (n,). `mpfjax.smoothing.conditional_filter` needs it.
-        And it may make its draws of standard normal noise, (n, k), which `Propagate(noise="rqmc")`
-        needs: `propose_from_noise(noise, now, previous_states)` returns what `propose`
-        does, and `noise_dimension(previous_states)` is k.
+        `now` contains the model, y_t and u_t. A proposal may also define `log_density(now, states,
+        previous_states)`, log q of states that were not drawn from it, (n,), which
+        `mpfjax.smoothing.conditional_filter` requires. If its draws are functions of standard
+        normal noise, (n, k), it may define `propose_from_noise(noise, now, previous_states)`, which
+        returns the same as `propose`, and `noise_dimension(previous_states)`, which is k;
+        `Propagate(noise="rqmc")` requires both.
         """
 
 

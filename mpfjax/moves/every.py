@@ -22,16 +22,16 @@ class Every(AbstractWrapper):
     """Run other moves at the steps k, 2k, 3k, ..., and none at the steps between.
 
     Vermaak et al. (2003), section 4, regroup "from time to time". Regrouping is exact at any time,
-    and need not be done at every step. The step's number is kept in the mixture's memory, so that a
-    run that continues from a checkpoint equals a run without interruption. The number does not
-    depend on the run: under `vmap` over seeds the steps between cost nothing. A missing observation
-    does not count as a step, since nothing is regrouped or resampled there.
+    and is not necessary at every step. The step number is stored in the mixture's memory, so that a
+    run that continues from a checkpoint equals an uninterrupted run. The number does not depend on
+    the run: under `vmap` over seeds the steps between take no time. A missing observation does not
+    count as a step, because nothing is regrouped or resampled there.
 
-    - `every`: k, from 1 on.
+    - `every`: k, at least 1.
     - `moves`: regrouping and resampling moves, in order.
 
     Raises `ValueError` for k < 1, no moves, and a move of another kind: without a propagation at
-    every step the state would not move. Use it where regrouping is a large part of the time.
+    every step the state would not move. Use it if regrouping takes a large part of the time.
     """
 
     every: Count = eqx.field(static=True)
@@ -47,11 +47,11 @@ class Every(AbstractWrapper):
 
     @property
     def name(self) -> str:
-        """The name under which the number of the step is kept."""
+        """The name under which the step number is stored."""
         return f"every {self.every}: {', '.join(type(move).__name__ for move in self.moves)}"
 
     def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
-        """The number of steps since the moves last ran, and the moves' own memory."""
+        """The number of steps since the moves last ran, and the memory of the moves."""
         counter = {self.name: {"steps": jnp.zeros((), jnp.int32)}}
         return counter | super().initial_memory(now, num_components)
 

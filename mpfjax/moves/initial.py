@@ -1,4 +1,4 @@
-"""x_0: its draws, and the choice among many draws by the first observation."""
+"""Selection of x_0: its draws, and the choice among many draws by the first observation."""
 
 import equinox as eqx
 import jax
@@ -30,27 +30,27 @@ FEWEST, LEAST_PART = 16, 1 / 64
 
 
 class SelectInitial(AbstractMove):
-    """An initial move that draws x_0 many times, and keeps the draws that y_1 speaks for.
+    """An initial move that draws x_0 many times, and selects draws that explain y_1.
 
-    K N draws of x_0 take the place of the mixture's N. From each, x_1 is drawn twice. ν is the mean
-    of the two likelihoods of y_1, shrunk towards the mean over all draws: the less the two
-    likelihoods of a draw agree, the less they tell of x_0 (`selection_weights`). N draws are kept
-    with probabilities in proportion to ν, and weigh 1 / ν, so that they represent x_0 as all do.
-    Their mass is part of the first increment, and Ẑ stays unbiased. A wide prior is covered as by
-    K N particles, at the cost of 2 K more draws of x_1 in the whole run.
+    K N draws of x_0 replace the N of the mixture. From each, x_1 is drawn twice. ν is the mean of
+    the two likelihoods of y_1, shrunk towards the mean over all draws: the less the two likelihoods
+    of a draw agree, the less information they contain on x_0 (`selection_weights`). N draws are
+    selected with probabilities in proportion to ν, and weighted by 1 / ν, so that they represent
+    x_0 as all draws do. Their total weight is part of the first increment, and Ẑ remains unbiased.
+    A diffuse prior is covered as by K N particles, for 2 K further draws of x_1 in the whole run.
 
-    Without an observation it does nothing. After it the chain's `Resample` waits for y_1, since it
-    would undo the choice.
+    Without an observation it does nothing. After it, the chain's `Resample` waits for y_1, because
+    an earlier resampling would undo the selection.
 
-    The filter's own propagation draws x_1, and weighs it.
+    The filter's propagation draws and weights x_1.
 
     - `num_draws`: K.
-    - `noise`: that of the draws of x_0, as `Filter.initial_noise`. With "rqmc" they are kept in
-      order along a Hilbert curve.
+    - `noise`: of the draws of x_0, as in `Filter.initial_noise`. With "rqmc" they are ordered along
+      a Hilbert curve.
 
-    Put it first among `initial_moves`, before those that regroup. Raises `ValueError` for K < 1
-    and unknown noise, and in a filter without `Propagate` or `PropagateNested`. Use it where the
-    prior is somewhat wide beside the likelihood; where it is very wide, `with_initialisation`.
+    It must be the first of the `initial_moves`, before those that regroup. Raises `ValueError` for
+    K < 1 and unknown noise, and in a filter without `Propagate` or `PropagateNested`. Use it if the
+    prior is somewhat broader than the likelihood; if it is far broader, use `with_initialisation`.
     """
 
     num_draws: Count = eqx.field(static=True, default=4)
@@ -63,7 +63,7 @@ class SelectInitial(AbstractMove):
     """any ν is exact, so that its derivative is not needed."""
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
-        """Raise a `ValueError` where no move draws x_1 of each x_0."""
+        """Raise a `ValueError` if no move draws x_1 of each x_0."""
         require_propagation(now, "x_0 is chosen")
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:

@@ -1,6 +1,6 @@
-"""One filter over many devices: islands of particles that share only their total mass.
+"""One filter on many devices: islands of particles that share only their total weight.
 
-Where their masses have become uneven, `IslandInteraction` deals the particles anew.
+If the weights of the islands have become uneven, `IslandInteraction` redistributes the particles.
 """
 
 import dataclasses
@@ -43,33 +43,32 @@ def run_islands(
     missing: Literal["error", "skip"] = "error",
     devices: int | Sequence[Any] | None = None,
 ) -> FilterRun:
-    """Run one filter of G islands, each a copy of `filter`, over many devices.
+    """Run one filter of G islands, each a copy of `filter`, on many devices.
 
     The islands are parts of ONE mixture of G N particles in G M components. Every island draws its
-    own x_0 and moves its own components. That is exact, since the weights are joint. Only the
-    normalisation needs all islands: a step's total mass is the sum of G masses, O(1) numbers from
-    each island, whatever N is (Vermaak et al. 2003, section 2: components "interact only through
-    the mixture weights"; Vergé et al. 2015 for islands). If the filter's marginal likelihood is
-    unbiased, so is this one.
+    own x_0 and moves its own components. This is exact, because the weights are joint. Only the
+    normalisation needs all islands: the total weight of a step is the sum of G weights, O(1)
+    numbers from each island, for any N (Vermaak et al. 2003, section 2: components "interact only
+    through the mixture weights"; Vergé et al. 2015 for islands). If the filter's marginal
+    likelihood is unbiased, so is the result.
 
-    - `observations`, `inputs`, `missing`: those of `run_filter`.
-    - `filter`: that of one island; N and M are those of one island. A plain particle filter makes
-      islands of particles. With an `IslandInteraction` among the moves, their masses stay even.
+    - `observations`, `inputs`, `missing`: as for `run_filter`.
+    - `filter`: the filter of one island, with its N and M. A standard particle filter makes islands
+      of particles. With an `IslandInteraction` among the moves, their weights stay even.
     - `num_islands`: G. The result depends on the key and on G, not on the devices. With another
-      number of devices it differs by rounding; where rounding changes a draw, it differs like
-      another run.
-    - `devices`: a number or a sequence of `jax.devices()`, whose number must divide G. None takes
+      number of devices it differs by rounding; if rounding changes a draw, it differs like another
+      run.
+    - `devices`: a number or a sequence of `jax.devices()`, whose number must divide G. None uses
       the largest number of devices that divides G.
-    - `collect(mixture)` sees one island, whose weights sum to its mass. Its results are stacked
-      over t and islands, (t, G, ...). The sum over islands of `expectation`, `mean` or `variance`
-      is that of the whole mixture.
+    - `collect(mixture)` receives one island, whose weights sum to its share. Its results are
+      stacked over t and islands, (t, G, ...). The sum over islands of `expectation`, `mean` or
+      `variance` is the value for the whole mixture.
 
     The result is that of `run_filter` on the whole mixture. Slots and component labels of island g
     come after those of island g - 1, ancestors may be on other islands, and only `memory` keeps a
-    leading axis of islands. Errors are those of
-    `run_filter`. Also raises `ValueError` for G < 1, and for devices that do not exist or do not
-    divide G. Use it if one filter is too large or too slow for one device. For many runs of a
-    filter that fits on one device, use `monte_carlo`.
+    leading axis of islands. Errors are those of `run_filter`. Also raises `ValueError` for G < 1,
+    and for devices that do not exist or do not divide G. Use it if one filter is too large or too
+    slow for one device. For many runs of a filter that fits on one device, use `monte_carlo`.
     """
     series = as_series(series_of(observations, inputs, missing), filter.model)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
@@ -143,24 +142,24 @@ def _whole_mixture(islands: ParticleMixture) -> ParticleMixture:
 
 
 class IslandInteraction(AbstractMove):
-    """Deal every island's particles to all islands where their masses have become uneven.
+    """Redistribute the particles over all islands if their weights have become uneven.
 
     It is for `run_islands`; elsewhere there is one island, and it does nothing. An island resamples
-    within itself and keeps its mass. After some time a few islands hold all the mass, and the
+    within itself and keeps its weight. After some time a few islands have all the weight, and the
     computations of the others are wasted. The effective number of islands is (Σ π_g)² / Σ π_g²,
-    where π_g is the mass of island g. Where it falls below `threshold` times the number of islands
-    G, particle i of every island goes to island i mod G, with its joint weight, component label and
-    ancestor. All islands then hold nearly the same mass. The move is exact: the whole mixture has
-    the same particles, in other places (Whiteley, Lee and Heine 2016, show when islands should
+    where π_g is the weight of island g. If it falls below `threshold` times the number of islands
+    G, particle i of every island moves to island i mod G, with its joint weight, component label
+    and ancestor. All islands then have nearly the same weight. The move is exact: the whole mixture
+    has the same particles, in other slots (Whiteley, Lee and Heine 2016, show when islands should
     interact).
 
     - `threshold`: in [0, 1]; 0 never exchanges.
 
     No other move sends particles between devices. This one sends all of them at once, but only in
-    the steps that need it. Put it before `Resample`, which then spreads the heavy particles over
-    the slots of all islands. In a mixture, put it before the moves that regroup, since components
-    of the same label become one. Raises `ValueError` for a threshold out of range, and where G does
-    not divide the number of slots of an island.
+    the steps that require it. Put it before `Resample`, which then distributes the heavy particles
+    over the slots of all islands. In a mixture, put it before the moves that regroup, because
+    components of the same label are joined. Raises `ValueError` for a threshold out of range, and
+    if G does not divide the number of slots of an island.
     """
 
     threshold: Share = eqx.field(static=True, default=0.5)

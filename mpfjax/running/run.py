@@ -37,21 +37,22 @@ def run_filter(
     - `observations`: a pytree whose leaves have a leading axis t; or a `Series`, for which `inputs`
       and `missing` are short.
     - `collect`: a function of the mixture after each step, or of (mixture, t, u_t) with t from 1
-      on; its results are stacked over t. None keeps the whole mixture. The same function object
-      compiles once; a new lambda in every call compiles again. Methods of a mixture are for one
-      mixture: `jax.vmap(lambda m: m.mean())` maps them over a collected stack.
-    - `inputs`: u_1, ..., u_t, what is known beside the observations: a pytree of finite numbers
-      whose leaves have a leading axis t. At each step the model finds u_t in its field `inputs`;
-      see `AbstractStateSpaceModel`. A step without an observation has an input all the same.
-    - `missing`: "error" raises a `ValueError` that names the first step whose observation holds a
-      NaN or an infinity. "skip" treats such steps as missing and only predicts. A model with
-      `handles_missing = True` gets the NaN; with "skip", only a step of nothing but NaN is
+      on; its results are stacked over t. None stores the whole mixture. The same function object
+      compiles once; a new lambda in every call compiles again. Methods of a mixture are for a
+      single mixture: `jax.vmap(lambda m: m.mean())` maps them over a collected stack.
+    - `inputs`: u_1, ..., u_t, known data besides the observations: a pytree of finite numbers whose
+      leaves have a leading axis t. At each step the model finds u_t in its field `inputs`; see
+      `AbstractStateSpaceModel`. A step without an observation has an input nevertheless.
+    - `missing`: "error" raises a `ValueError` that names the first step whose observation has a NaN
+      or an infinity. "skip" treats such steps as missing and only predicts. A model with
+      `handles_missing = True` receives the NaN; with "skip", only a step with nothing but NaN is
       missing.
 
     Raises `ValueError` before anything compiles: for an argument of another kind, no observations,
-    leaves of different lengths, complex numbers, numbers that JAX's type cannot hold, or inputs of
-    a model that has no place for them. Raises `ValueError` during tracing for a model whose draws
-    or densities have the wrong shape or type, and RuntimeError if its densities give NaN.
+    leaves of different lengths, complex numbers, numbers that JAX's type cannot represent, or
+    inputs of a model that has no field for them. Raises `ValueError` during tracing for a model
+    whose draws or densities have the wrong shape or type, and RuntimeError if its densities are
+    NaN.
     """
     series = as_series(series_of(observations, inputs, missing), filter.model)
     run = with_floats_traced(lambda traced: _run(key, traced, series, collect), filter)
@@ -77,15 +78,16 @@ def monte_carlo(
 
     - `devices`: the devices that share the runs. None is every device, of all processes after
       `jax.distributed.initialize`. A number means the first few, a sequence those of
-      `jax.devices()`. The number of keys need not be a multiple of theirs. Devices exchange
-      nothing. The result is gathered on the first one, and each process has all of it. Under the
-      caller's own jit, grad or vmap, None is one device. On one CPU device, the runs are shared by
-      a thread for each processor, if there is enough to do.
+      `jax.devices()`. The number of keys need not be a multiple of the number of devices. Devices
+      exchange nothing. The result is gathered on the first one, and each process has all of it.
+      Under the caller's own jit, grad or vmap, None is one device. On one CPU device, the runs are
+      shared by a thread for each processor, if there is enough to do.
     - `num_slots`: the length of the particle arrays, at least N; the slots after the first N stay
-      empty. None is N. Filters that differ in N alone compile once if they have the same
-      `num_slots`: 1000, for example, for N = 50, 200 and 1000; the start alone compiles for each N.
-      Each then costs as much as 1000 particles. A run has the law of one without `num_slots`,
-      though not the same particles. `collect` sees the empty slots as well, with `occupied` false.
+      empty. None is N. Filters that differ only in N compile once if they have the same
+      `num_slots`: 1000, for example, for N = 50, 200 and 1000; only the initialisation compiles for
+      each N. Each run then takes as long as 1000 particles. A run has the same distribution as one
+      without `num_slots`, though not the same particles. `collect` receives the empty slots as
+      well, with `occupied` false.
 
     Raises `ValueError` for more devices than there are, fewer slots than particles, and `num_slots`
     with the moves that need every slot, `PropagateIndependently` and `PropagateInClusters`.

@@ -1,4 +1,4 @@
-"""Monte Carlo studies over filters, numbers of particles and settings; they can be interrupted."""
+"""Monte Carlo studies over filters, numbers of particles and settings, which can be interrupted."""
 
 import datetime
 import importlib
@@ -48,11 +48,11 @@ def nothing(mixture: ParticleMixture) -> None:
 
 
 class Study(Checked):
-    """A grid of filters x N x settings. Each cell is the Monte Carlo runs of one filter.
+    """A grid of filters x N x settings, in which each cell is the Monte Carlo runs of one filter.
 
     Raises `ValueError` for an argument of another kind, an axis that is empty or has a value twice,
-    numbers of particles that are not whole, a setting that is not a number or a string, a function
-    that returns no filter, and what `monte_carlo` raises it for.
+    numbers of particles that are not integers, a setting that is not a number or a string, a
+    function that does not return a filter, and as `monte_carlo` does.
     """
 
     filters: Annotated[Mapping[str, Callable[..., Filter]], by_name(callable, "functions of N")]
@@ -90,11 +90,11 @@ def run_study(
     cells_at_once: Count = 1,
     num_slots: Count | None = None,
 ) -> list[dict[str, Any]]:
-    """Run every cell of a study; with `resume`, go on where it was interrupted or killed.
+    """Run every cell of a study; with `resume`, continue where it was interrupted or killed.
 
-    Each cell is written to a file of its own in `directory` as soon as it is finished, so only
+    Each cell is written to a separate file in `directory` as soon as it is finished, so only
     unfinished cells can be lost. Returns one dict for each cell: its `filter`, `num_particles`,
-    settings and measured arrays. On a terminal a bar shows the time left.
+    settings and measured arrays. On a terminal a bar shows the remaining time.
 
         circle = lambda num_particles, noise: mpfjax.mixture_particle_filter(
             Circle(noise), num_particles, max_components=4)
@@ -102,23 +102,23 @@ def run_study(
                              observations, settings={"noise": [0.1, 0.3]})
         results = mpfjax.run_study(study, "results/circle")
 
-    - `resume`: take over the finished cells that `directory` holds, and print how many these are
-      and of which day. They are of this study if names (of filters, `measure` and `collect`),
-      sizes, settings, keys, data and versions are the same. What functions do cannot be compared:
-      take a new directory after you change one. False refuses a directory that holds cells.
+    - `resume`: reuse the finished cells in `directory`, and print how many these are and from which
+      day. They belong to this study if names (of filters, `measure` and `collect`), sizes,
+      settings, keys, data and versions are the same. The code of functions cannot be compared: use
+      a new directory after you change it. False refuses a directory with cells.
     - `seeds_at_once`: how many seeds share one `vmap`; None is all. Set it if memory is short.
     - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both. Several
       processes must work on the same cell, and so run one cell at a time.
     - `num_slots`: the length of the particle arrays, as for `monte_carlo`, in all cells with at
       most so many particles. A filter then compiles once for all these N. Use it for small filters,
-      where the study spends more time on compiling than on running. A filter that fills every slot,
+      if the study spends more time on compiling than on running. A filter that fills every slot,
       such as `independent_particle_filters`, raises an error.
 
     Raises `ValueError` before anything runs: for an argument of another kind, for a `directory`
-    that holds cells, and with `resume` for one of another study, naming what differs, and for files
-    in it that are cut off. Delete such files, and only their cells run again. Raises `OSError` if a
-    cell cannot be written, for example on a full disk; finished cells stay. Several processes share
-    one directory, which the first one writes. Use it where a loop over `monte_carlo` would take
+    with cells, and with `resume` for the directory of another study, naming the difference, and for
+    truncated files in it. Delete such files, and only their cells run again. Raises `OSError` if a
+    cell cannot be written, for example on a full disk; finished cells remain. Several processes
+    share one directory, which the first one writes. Use it if a loop over `monte_carlo` would take
     long.
     """
     directory = Path(directory)
@@ -158,8 +158,8 @@ def run_study(
 def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
     """The finished cells of a study, as `run_study` returns them.
 
-    It does not need the `Study`, and works while the study runs. Raises `FileNotFoundError` where
-    there is no such directory, and `ValueError` for files in it that are cut off, damaged or of
+    It does not need the `Study`, and works while the study runs. Raises `FileNotFoundError` if the
+    directory does not exist, and `ValueError` for files in it that are truncated, damaged or from
     different studies.
     """
     return list(_read_cells(Path(directory).resolve(strict=True)).values())

@@ -1,4 +1,4 @@
-"""Standard errors of log Ẑ, masses and means: from one run by Eve indices, or from a batch."""
+"""Standard errors of log Ẑ, mixture weights and means: by Eve indices, or from a batch of runs."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -69,10 +69,10 @@ class _KeepEveIndices(AbstractMove):
 def with_eve_indices(filter: Filter) -> Filter:
     """A copy of the filter that also stores the Eve index of each particle.
 
-    Draws and weights are the same to the bit, but that no `SelectInitial` chooses x_0: what it
-    keeps are no independent draws. A step takes O(N) more memory and time, and the runs
-    can be given to `log_marginal_likelihood_variance` and `mixture_weight_errors`. `StepInfo` then
-    has both errors at every step. Raises `ValueError` for anything but a filter, for a filter whose
+    Draws and weights are identical to the bit, except that no `SelectInitial` selects x_0, because
+    its draws are not independent. A step takes O(N) more memory and time, and the runs can be
+    passed to `log_marginal_likelihood_variance` and `mixture_weight_errors`. `StepInfo` then has
+    both errors at every step. Raises `ValueError` for anything but a filter, for a filter whose
     particles have no single ancestors or whose Ẑ is not unbiased (one with an approximate move,
     `PropagateIndependently`, `PropagateInClusters` or `IslandInteraction`), and for draws that are
     not independent: a scheme other than "multinomial", or a noise other than "independent".
@@ -87,10 +87,10 @@ def with_eve_indices(filter: Filter) -> Filter:
 def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[Array, ""]:
     """An estimate of the variance of log Ẑ, from one run of `with_eve_indices(filter)`.
 
-    Particles with different ancestors in x_0 are nearly independent. The fewer families hold the
-    weight, the more Ẑ varies (Chan and Lai 2013). A family is all descendants of one particle of
-    x_0. For one component the estimate is that of Lee and Whiteley (2018), section 3: with S_e the
-    weight of all descendants of particle e of x_0, and r resamplings so far,
+    Particles with different ancestors in x_0 are nearly independent. The fewer families have most
+    of the weight, the more Ẑ varies (Chan and Lai 2013). A family is all descendants of one
+    particle of x_0. For one component the estimate is that of Lee and Whiteley (2018), section 3:
+    with S_e the weight of all descendants of particle e of x_0, and r resamplings so far,
 
         V = 1 - (N / (N - 1))^(r + 1) (1 - Σ_e S_e²).
 
@@ -101,31 +101,31 @@ def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[
     model, with an MPF of 1000 particles after 100 steps, the mean of V is .83 s², and that of V +
     V² / 2 is .98 s². A single estimate may be negative.
 
-    In a mixture, components are resampled on their own. Two offspring in different components are
-    drawn independently of each other. Two in the same one, of k_m draws, are different draws for
-    (k_m - 1) / k_m of the pairs only. Hence a pair counts by the product of k_m / (k_m - 1) over
-    the resamplings of components that their ancestors were in together:
+    In a mixture, components are resampled separately. Two offspring in different components are
+    drawn independently of each other. Of the pairs of offspring in the same component, with k_m
+    draws, only a fraction (k_m - 1) / k_m are different draws. Hence a pair is weighted by the
+    product of k_m / (k_m - 1) over the resamplings of components that contained both ancestors:
 
         V = 1 - N / (N - 1) Σ_{i, j without common Eve index} W_i W_j Π k_m / (k_m - 1).
 
     The products of all pairs would be O(N²) numbers. They are averaged over the pairs of each two
-    components, which are M² numbers, and exact for one component or where all components are
-    pooled before resampling (DPS). Resampling on objects within `Partitioned` counts as well.
+    components, which are M² numbers, and exact for one component or if all components are pooled
+    before resampling (DPS). Resampling between objects within `Partitioned` is included.
 
     This holds for x_0 drawn independently and for scheme "multinomial", with any `ess_threshold`.
     The other schemes draw more evenly than the independent draws of the formula, and no consistent
     estimate is known for them. For "systematic" V is far too small: with N = 1000 and t = 100 it
-    was a seventh of the variance for a PF on a linear-Gaussian model, and negative for an MPF on
-    the quadratic one. The estimate needs several families. If t is not much less than N, few are
-    left. With one family it is 1.5, whatever the truth is. A component of one particle, which has
-    no pair, is left out of the product.
+    was a seventh of the variance for a PF on a linear Gaussian model, and negative for an MPF on
+    the quadratic one. The estimate requires several families. If t is not much less than N, few are
+    left. With one family it is 1.5, regardless of the true variance. A component of one particle,
+    which has no pair, is omitted from the product.
 
-    - `run`: a `FilterRun`, or a mixture that `step` returned. Use `jax.vmap` for those of
+    - `run`: a `FilterRun`, or a mixture that `step` returned. Use `jax.vmap` for the results of
       `monte_carlo`.
 
     The estimate is inf for a run with a step of zero likelihood, whose log Ẑ is -inf. Raises
-    `ValueError` for a run of a filter without Eve indices, and one of islands. Use it to
-    choose N: particle Metropolis-Hastings wants a variance of about one (Doucet et al. 2015).
+    `ValueError` for a run of a filter without Eve indices, and one of islands. Use it to choose N:
+    particle Metropolis-Hastings works best with a variance of about one (Doucet et al. 2015).
     """
     mixture = _with_lineage(run)
     degenerate = run.degenerate if isinstance(run, FilterRun) else jnp.zeros(1, bool)
@@ -136,27 +136,27 @@ def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[
 def mixture_weight_errors(run: FilterRun | ParticleMixture) -> Float[Array, " m"]:
     """The standard error of each mixture weight π_m, from a run of `with_eve_indices(filter)`.
 
-    How much π_m would vary over runs of the same filter. π_m is the estimate of the probability of
-    an event, that a particle is in component m, and its variance is that of Lee and Whiteley
-    (2018), section 4, for a normalised estimate: the formula of `log_marginal_likelihood_variance`
-    with W_i (1[c_i = m] - π_m) in place of the weights,
+    It is the standard deviation of π_m over runs of the same filter. π_m is the estimate of the
+    probability of an event, that a particle is in component m, and its variance is that of Lee and
+    Whiteley (2018), section 4, for a normalised estimate: the formula of
+    `log_marginal_likelihood_variance` with W_i (1[c_i = m] - π_m) instead of the weights,
 
         V_m = - N / (N - 1) Σ_{i, j without common Eve index} u_i u_j Π k_m / (k_m - 1).
 
-    For one resampling in common it is the sum over families of (S_em - π_m S_e)², S_em being the
+    For one common resampling it is the sum over families of (S_em - π_m S_e)², where S_em is the
     part of family e that is in component m.
 
-    It tells whether the data decide between two explanations: 0.7 ± 0.3 decides nothing. It holds
-    where `log_marginal_likelihood_variance` does: multinomial draws. It takes the components as
-    given, so it says nothing of runs that would have grouped the particles in another way. It is
-    too small if few families are left: a component whose ancestors' families are in no other
-    component seems certain. Where V_m is negative, its root is given as zero.
+    It shows whether the data decide between two explanations: 0.7 ± 0.3 decides nothing. It holds
+    under the same conditions as `log_marginal_likelihood_variance`: multinomial draws. It treats
+    the components as fixed, so it does not account for runs that would have grouped the particles
+    in another way. It is too small if few families are left: a component whose ancestors' families
+    are in no other component appears certain. If V_m is negative, its root is returned as zero.
 
     - `run`: a `FilterRun`, or a mixture that `step` returned. `StepInfo.mixture_weight_errors` has
-      them at every step. In `collect`, call it of each mixture.
+      them at every step. In `collect`, apply it to each mixture.
 
-    Raises `ValueError` for a run of a filter without Eve indices, and one of islands. Use it to
-    see whether a mass is reliable.
+    Raises `ValueError` for a run of a filter without Eve indices, and one of islands. Use it to see
+    whether a mixture weight is reliable.
     """
     return jnp.sqrt(jnp.maximum(_mass_variances(_with_lineage(run)), 0.0))
 
@@ -180,8 +180,8 @@ class BatchEstimate(NamedTuple):
 
     - `value` and `error`: the expectation, and its standard error.
     - `log_marginal_likelihood` and `log_marginal_likelihood_error`: log of the mean of Ẑ.
-    - `effective_runs`: (Σ Ẑ)² / Σ Ẑ²: below about a third of the runs, errors are too small
-      themselves.
+    - `effective_runs`: (Σ Ẑ)² / Σ Ẑ²: below about a third of the runs, the errors themselves are
+      too small.
     """
 
     value: Float[Array, " *shape"]
@@ -204,19 +204,19 @@ def batch_estimate(
 
     and Ẑ is unbiased (Vergé et al. 2015). The errors are those of the jackknife over runs (Efron
     1982), (B - 1) / B Σ_b (q_(b) - mean of q_(.))², with q_(b) the estimate without run b. They
-    need only independent runs, and hold for every scheme, noise and move. (`with_eve_indices`
-    needs multinomial draws.)
+    require only independent runs, and hold for every scheme, noise and move. (`with_eve_indices`
+    requires multinomial draws.)
 
-    - `runs`: what `monte_carlo` returned for B keys, four or more. Twelve to thirty of N / B
-      particles each are a good choice. Take enough particles that log Ẑ of a single run has a
+    - `runs`: the result of `monte_carlo` for B keys, four or more. Twelve to thirty runs of N / B
+      particles each are a good choice. Use enough particles that log Ẑ of a single run has a
       standard deviation of about one or less. Otherwise a few runs have most of the weight; see
       `effective_runs`.
     - `quantity`: a function of one mixture, such as `lambda m: m.expectation(m.particles > 0)`. For
-      a mass take the probability of a place or an event, since the labels of components differ
-      between runs.
+      the weight of a mode use the probability of a region or an event, because the labels of
+      components differ between runs.
 
     Runs of zero likelihood have no weight. Raises `ValueError` for fewer runs, and for anything but
-    a stack of runs. Use it to see whether a mass can be trusted.
+    a stack of runs. Use it to see whether a mixture weight can be trusted.
     """
     number = runs.log_marginal_likelihood.size
     if runs.log_marginal_likelihood.ndim != 1 or number < FEWEST_RUNS:

@@ -84,7 +84,7 @@ class Associate(AbstractWrapper):
     - `undetected_particles`: the number of particles of component 0, which fill the first slots.
     - `resample`: the move that redraws each object, with a number of particles by its weight.
 
-    Raises `ValueError` on islands, for `slots`, and if there are no slots for the objects.
+    Raises `ValueError` on islands, for `num_slots`, and if there are no slots for the objects.
     """
 
     particles_per_birth: Count = eqx.field(static=True, default=50, kw_only=True)

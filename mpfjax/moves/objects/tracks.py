@@ -1,4 +1,4 @@
-"""What a filter of objects that come and go tells: tracks, and how many objects there are."""
+"""Summaries of a filter of an unknown number of objects: tracks, and the number of objects."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -17,16 +17,16 @@ _LEAST_EXISTENCE = 0.5
 
 
 class TargetEstimates(NamedTuple):
-    """The objects of one step, an entry for each component that may hold one.
+    """The objects of one step, with an entry for each component that may represent one.
 
-    - `labels`: of each object, from 1 on, 0 where there is none.
-    - `existence`: the probability that it exists, zero where there is none.
-    - `means`, `covariances`: of its state; the state's own form, NaN where there is
-      none, and (M, d, d) of the flat one.
-    - `quantiles`: of each number of the flattened state, (M, q, d); None where none are asked for.
-    - `number`: the median of how many there are, whose mean error is least.
-    - `expected_number`: of all objects; `undetected` of them have not been revealed yet.
-    - `crowded_out`: how many objects to expect that found no component in this step.
+    - `labels`: of each object, from 1 on, 0 if there is none.
+    - `existence`: the existence probability, zero if there is no object.
+    - `means`, `covariances`: of its state; in the form of the state, NaN if there is none, and (M,
+      d, d) for the flattened state.
+    - `quantiles`: of each component of the flattened state, (M, q, d); None unless requested.
+    - `number`: the median of the number of objects, which minimises the mean absolute error.
+    - `expected_number`: of all objects, of which `undetected` have not been revealed yet.
+    - `crowded_out`: the expected number of objects for which there was no component in this step.
     """
 
     labels: Int[Array, " m"]
@@ -43,7 +43,7 @@ class TargetEstimates(NamedTuple):
 def estimate_targets(mixture: ParticleMixture, q: Sequence[float] = ()) -> TargetEstimates:
     """The objects of a `bernoulli_filter`, for `collect=estimate_targets` or one mixture.
 
-    - `q`: which quantiles to find, such as (0.05, 0.95). They cost a sort for each component.
+    - `q`: the quantiles to compute, such as (0.05, 0.95), which require a sort for each component.
 
     Raises `ValueError` for a mixture of another filter. Use it with `number_distribution`, and with
     `track_table` for a table of a whole run.
@@ -76,10 +76,10 @@ def estimate_targets(mixture: ParticleMixture, q: Sequence[float] = ()) -> Targe
 
 
 def number_distribution(existence: Float[Array, " m"]) -> Float[Array, " n"]:
-    """P(0), ..., P(M) objects, of which each exists with its own probability.
+    """P(0), ..., P(M) objects, each of which exists with its own probability.
 
-    The distribution of a sum of independent events, Poisson-binomial. Objects that no measurement
-    has revealed are a Poisson number more, of mean `undetected`.
+    The distribution of a sum of independent events, Poisson-binomial. Undetected objects are a
+    Poisson number in addition, with mean `undetected`.
     """
 
     def with_one_more(shares: Float[Array, " n"], r: Float[Array, ""]) -> tuple:
@@ -93,11 +93,12 @@ def number_distribution(existence: Float[Array, " m"]) -> Float[Array, " n"]:
 def track_table(run: TargetEstimates) -> dict[str, np.ndarray]:
     """The tracks of a run as columns: `pandas.DataFrame(track_table(run.collected))`.
 
-    - `run`: what `run_filter(..., collect=estimate_targets)` collected, with a leading axis of
+    - `run`: the result of `run_filter(..., collect=estimate_targets)`, with a leading axis of
       steps.
-    A track has a row for each step in which its object exists with a probability of a half or more.
-    The columns are `step`, from 1 on, `label`, `existence`, and `mean_k` and `deviation_k` of each
-    number of the state. Warns where objects were crowded out, with the first such step.
+
+    A track has a row for each step in which its object exists with a probability of at least one
+    half. The columns are `step`, from 1 on, `label`, `existence`, and `mean_k` and `deviation_k` of
+    each component of the state. Warns if objects were crowded out, with the first such step.
     """
     lost = np.asarray(run.crowded_out)
     if len(steps := np.flatnonzero(lost >= _LEAST_EXISTENCE)):

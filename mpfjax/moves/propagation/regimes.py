@@ -1,4 +1,4 @@
-"""Finitely many latents: the optimal proposal, and all children of each particle with few kept."""
+"""Latents with finitely many values: the optimal proposal, and enumeration of all children."""
 
 from typing import Any
 
@@ -31,14 +31,14 @@ from mpfjax.operations.stored import take
 class RegimeProposal(AbstractProposal):
     """The optimal proposal of a latent with finitely many values, p(z_t | z_{t-1}, y_1..y_t).
 
-    Each of the K values of z_t that may follow is weighed by p(z_t | z_{t-1}) and the predictive
-    density of y_t, and one is drawn (Chen and Liu 2000; Doucet, Gordon and Krishnamurthy 2001). Its
+    Each of the K values of z_t is weighted by p(z_t | z_{t-1}) and the predictive density of y_t,
+    and one is drawn (Chen and Liu 2000; Doucet, Gordon and Krishnamurthy 2001). Its
     `log_normaliser` is exactly log p(y_t | z_{t-1}, y_1..y_{t-1}), so that
-    `auxiliary_particle_filter(model, N, RegimeProposal())` is fully adapted: all weights are
-    equal after a step. One step takes K predictive densities a particle.
+    `auxiliary_particle_filter(model, N, RegimeProposal())` is fully adapted: all weights are equal
+    after a step. One step evaluates K predictive densities per particle.
 
     Raises `ValueError` in a filter of a model that is not conditionally linear, or has no
-    `all_transitions` or `log_transition`. Use it where the number of regimes is small.
+    `all_transitions` or `log_transition`. Use it if the number of regimes is small.
     """
 
     def check(self, now: Step) -> None:
@@ -60,7 +60,7 @@ class RegimeProposal(AbstractProposal):
     def propose_from_noise(
         self, noise: Float[Array, "n 1"], now: Step, previous_states: MarginalisedState
     ) -> tuple[PyTree, Float[Array, " n"]]:
-        """z_t from this noise, and log q of each."""
+        """z_t as a function of this noise, and log q of each."""
         return self._drawn(ndtr(noise[:, 0]), now, previous_states)
 
     def log_normaliser(self, now: Step, previous_states: MarginalisedState) -> Float[Array, " n"]:
@@ -83,26 +83,26 @@ class RegimeProposal(AbstractProposal):
 
 
 class PropagateRegimes(AbstractPropagation):
-    """Try all K regimes for each particle, then resample optimally to the number of slots.
+    """Evaluate all K regimes of each particle, then resample optimally to the number of slots.
 
     z_t takes K values, and every particle has K children, each with the weight w_i p(z_t | z_{t-1})
-    p(y_t | ...). Of these N K children, every component keeps as many as it has slots, by the
-    optimal resampling of Fearnhead and Clifford (2003): a child of weight w is kept with the
+    p(y_t | ...). Of these N K children, every component retains as many as it has slots, by the
+    optimal resampling of Fearnhead and Clifford (2003): a child of weight w is retained with
     probability min(w / c, 1), and then has the weight max(w, c). The constant c makes the expected
     number of children equal to the number of slots. Heavy children keep their weight, and none is
-    kept twice. Of all unbiased choices this one changes the weights least. A component keeps its
-    mass, and Ẑ is unbiased. A `Resample` before it would only add noise: `Filter(model,
+    duplicated. Of all unbiased choices this one changes the weights least. A component keeps its
+    weight, and Ẑ is unbiased. A `Resample` before it would only add noise: `Filter(model,
     [PropagateRegimes()], N)` is the whole filter.
 
     - `regroup`: a `GroupBy` that regroups the children before the choice; None leaves them in their
-      parents' components. Regrouped by the regime, every regime has its share of the slots at
-      every step, however improbable it is: the IMM particle filter (Blom and Bloem 2007) with
-      Kalman filters for particles.
+      parents' components. Regrouped by the regime, every regime has its share of the slots at every
+      step, however improbable it is: the IMM particle filter (Blom and Bloem 2007) with Kalman
+      filters as particles.
 
-    A derivative treats the probabilities of being kept as constants, as that of
-    `Resample(gradient="stop")` does, so that derivatives of Ẑ are unbiased. Without an observation,
+    A derivative treats the probabilities of being retained as constants, as with
+    `Resample(gradient="stop")`, so that derivatives of Ẑ are unbiased. Without an observation,
     children have the weight w_i p(z_t | z_{t-1}). Raises `ValueError` in a filter of a model that
-    is not conditionally linear, or has no `all_transitions`. Use it where K is small.
+    is not conditionally linear, or has no `all_transitions`. Use it if K is small.
     """
 
     regroup: GroupBy | None = None
