@@ -1,7 +1,7 @@
-"""A robot that knows its map, and not its place: occupancy grids, laser scanners and odometry.
+"""Robots with a map and an unknown pose: occupancy grids, laser scanners and odometry.
 
-After Thrun, Burgard and Fox (2005), *Probabilistic Robotics*, with the names that AMCL and nav2
-give to parameters. Places are (x, y) in metres, poses (x, y, heading) with radians.
+After Thrun, Burgard and Fox (2005), *Probabilistic Robotics*, with the parameter names of AMCL and
+nav2. Positions are (x, y) in metres, poses (x, y, heading) with radians.
 """
 
 from mpfjax.robots.localisation import RobotModel as RobotModel

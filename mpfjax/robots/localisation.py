@@ -1,4 +1,4 @@
-"""The model of a robot that is somewhere on its map."""
+"""The model of a robot at an unknown pose on its map."""
 
 from typing import Annotated, Any
 
@@ -39,7 +39,7 @@ _SENSOR = Rule(
 
 
 class RobotModel(AbstractStateSpaceModel, Fitting):
-    """A robot that is lost in a map: states are poses (x, y, heading), in metres and radians.
+    """A robot on a map: states are poses (x, y, heading), in metres and radians.
 
     - `grid`: the map, see `read_map`.
     - `motion`: `OdometryMotion`, or another with `noise_dimension` and `from_noise(noise, poses,
@@ -47,16 +47,16 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
     - `sensor`: `LikelihoodField`, `BeamModel`, or another with `log_likelihood(scan, poses, grid)`.
     - `clearance`: x_0 is farther than this from all occupied cells, metres; the robot's radius.
     - `initial_pose`, `initial_deviations`: x_0 is normal about this pose, with these standard
-      deviations of x, y and heading. None: it is uniform on the free cells and on all headings.
+      deviations of x, y and heading. None: it is uniform over the free cells and over all headings.
 
     Inputs are odometry, one step (forward, left, turn) in the robot's frame at a time, see
-    `odometry_steps`, and observations are scans (k,), of which some beams may be missing. The robot
+    `odometry_steps`, and observations are scans (k,), in which some beams may be missing. The robot
     may be where the map is free or unknown. The likelihood of a pose in an occupied cell or off the
-    map is zero: a step that leaves all particles there is `degenerate`, and its particles keep
-    their weights. `starts` are the corners of the cells of x_0.
+    map is zero: a step that moves all particles there is `degenerate`, and its particles keep their
+    weights. `starts` are the corners of the cells of x_0.
 
-    Raises `ValueError` where no cell is free, and for an `initial_pose` off the map, in an occupied
-    cell, or of coordinates that float32 cannot tell apart. Warns of inputs that look like poses.
+    Raises `ValueError` if no cell is free, and for an `initial_pose` off the map, in an occupied
+    cell, or with coordinates that float32 cannot resolve. Warns of inputs that look like poses.
     """
 
     grid: OccupancyGrid
@@ -102,7 +102,7 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
             raise ValueError(f"initial_pose: ({x:g}, {y:g}) is {where}")
 
     def check_inputs(self, inputs: Any) -> None:
-        """Warn of odometry that looks like poses, whose headings point along their own way."""
+        """Warn of odometry that looks like poses, whose headings point along their path."""
         if getattr(inputs, "shape", ())[1:] != (3,) or len(inputs) < 8:
             return
         poses = np.asarray(inputs, float)
@@ -129,7 +129,7 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
         return jnp.concatenate([places, np.pi * (2 * shares[:, 2:] - 1)], axis=1)
 
     def log_initial(self, states: Poses) -> Float[Array, " n"]:
-        """log p(x_0), by square metre and radian."""
+        """log p(x_0), per square metre and radian."""
         if self.initial_pose is not None:
             x, y, turn = (states - self.initial_pose[None]).T
             steps = jnp.stack([x, y, wrap(turn)], axis=1)
@@ -144,7 +144,7 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
         return self.motion.noise_dimension
 
     def transition_from_noise(self, noise: Float[Array, "n k"], states: Poses) -> Poses:
-        """x_t, after the step that odometry says."""
+        """x_t, after the step of the odometry."""
         if self.inputs is None:
             raise ValueError("inputs: None, but a RobotModel needs odometry, a row for each step")
         return self.motion.from_noise(noise, states, self.inputs)

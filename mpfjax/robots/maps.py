@@ -1,4 +1,4 @@
-"""Occupancy grids: cells, distances from walls, ranges along rays, and maps in files."""
+"""Occupancy grids: cells, distances to walls, ranges along rays, and maps in files."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,14 +38,14 @@ class OccupancyGrid(Fitting):
 
     - `occupied`: (rows, columns), from the lowest y up. At least one cell is.
     - `free`: of the same shape; a cell that is neither is unknown, and one that is both occupied.
-      None takes all others.
+      None means all cells that are not occupied.
     - `resolution`: the side of a cell in metres.
     - `origin`: (x, y) of the lower left corner of the cell [0, 0].
 
-    `distances` are metres from each cell's centre to the centre of the nearest occupied cell at the
-    edge of a block of them, so that a beam that ends deep inside a block is far from what it may
-    have met. Raises `ValueError` for arrays that do not fit, a map without walls, and an origin so
-    far away that float32 cannot tell the cells apart. Use `read_map` for one in a file.
+    `distances` are metres from the centre of each cell to the centre of the nearest occupied cell
+    at the edge of a block of them, so that a beam that ends deep inside a block is far from what it
+    may have hit. Raises `ValueError` for arrays that do not agree, a map without walls, and an
+    origin so far away that float32 cannot resolve the cells. Use `read_map` for a map in a file.
     """
 
     occupied: Bool[Array, "rows columns"]
@@ -72,7 +72,7 @@ class OccupancyGrid(Fitting):
         self.distances = jnp.asarray(resolution * np.asarray(distance_transform_edt(~edges)), float)
 
     def cells(self, places: Float[Array, "*n 2"]) -> tuple[Array, Array, Array]:
-        """Row and column of each place, or of the nearest cell, and whether it is on the map."""
+        """Row and column of each position, or of the nearest cell, and whether it is on the map."""
         columns, rows = (
             jnp.floor((places[..., k] - self.origin[k]) / self.resolution).astype(jnp.int32)
             for k in (0, 1)
@@ -85,19 +85,19 @@ class OccupancyGrid(Fitting):
         return jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1), inside
 
     def at(self, places: Float[Array, "*n 2"], values: Cells, outside: Any) -> Shaped[Array, "*n"]:
-        """The value of the cell of each place, such as of `grid.free`, and another off the map."""
+        """The value of the cell of each position, such as of `grid.free`, or another off it."""
         rows, columns, inside = self.cells(places)
         return jnp.where(inside, values[rows, columns], outside)
 
     def ranges(self, poses: Poses, angles: Angles, max_range: float) -> Beams:
         """Metres from each pose to the border of the first occupied cell along each angle.
 
-        At most `max_range`; zero from within an occupied cell. The angles are counted from the
-        heading. A ray goes from border to border of the cells on its way (Amanatides and Woo 1987),
-        so that it passes no wall, not even between two cells that share a corner; where all walls
-        are far, it advances by the field of distances (sphere tracing: Hart 1996). Unknown cells do
-        not stop it, and beyond the map there is none. With a table, see `tabulated`, a range is
-        looked up.
+        At most `max_range`; zero from within an occupied cell. The angles are relative to the
+        heading. A ray proceeds from border to border of the cells on its path (Amanatides and Woo
+        1987), so that it passes through no wall, not even between two cells that share a corner; if
+        all walls are far, it advances by the field of distances (sphere tracing: Hart 1996).
+        Unknown cells do not stop it, and there are no walls beyond the map. With a table, see
+        `tabulated`, a range is looked up.
         """
         if self.table is not None:
             return self._look_up(poses, angles, max_range)
@@ -144,14 +144,15 @@ class OccupancyGrid(Fitting):
         return self.resolution * jnp.minimum(reach, limit)
 
     def tabulated(self, num_angles: int = 120) -> "OccupancyGrid":
-        """The map with all ranges from each cell's centre at so many angles, looked up by `ranges`.
+        """The map with a table of ranges from each cell's centre at several angles, for `ranges`.
 
-        It has rows · columns · num_angles numbers. A range is that along the nearest of the angles
-        from the cell's centre, less how far ahead of the centre the place is. It is approximate: on
-        a map of cells of 5 cm with thin pillars, half of the errors are below 1 cm, but of beams up
-        to 3.5 m six in a hundred are off by more than 10 cm, at the edges of what they meet or
-        miss, and the mean error is 7 cm (5.5 cm with 240 angles). Use it with a `BeamModel`, whose
-        `z_rand` and `z_short` allow for such beams; its step then takes a small part of the time.
+        It has rows · columns · num_angles numbers. A range is the tabulated one along the nearest
+        angle from the cell's centre, minus the distance of the position ahead of the centre. It is
+        approximate: on a map of cells of 5 cm with thin pillars, half of the errors are below 1 cm,
+        but six in a hundred beams of up to 3.5 m are off by more than 10 cm, at the edges of what
+        they hit or miss, and the mean error is 7 cm (5.5 cm with 240 angles). Use it with a
+        `BeamModel`, whose `z_rand` and `z_short` allow for such beams; its step then takes a small
+        part of the time.
         """
         angles = jnp.arange(num_angles, dtype=float) * (2 * np.pi / num_angles)
         rows, columns = self.resolution * (np.indices(self.occupied.shape) + 0.5)
@@ -190,17 +191,16 @@ def read_map(
     """The map in ROS's `map.yaml`, with the image that it names, or in an image alone.
 
     A pixel of value v in 0..255, the mean of its colours, is occupied with p = (255 - v) / 255, or
-    v / 255 if the file says `negate`. Its cell is occupied where p > `occupied_thresh`, free where
-    p < `free_thresh`, by default .65 and .196, and unknown between and where the pixel is
-    transparent. Images of 16 bits are read as of eight. What the file says comes before the
-    arguments; an image alone needs `resolution`, metres per pixel. `origin` is the place of its
-    lower left corner.
+    v / 255 if the file has `negate`. Its cell is occupied if p > `occupied_thresh`, free if p <
+    `free_thresh`, by default .65 and .196, and unknown between and if the pixel is transparent.
+    Images of 16 bits are read as of eight. The file takes precedence over the arguments; an image
+    alone needs `resolution`, metres per pixel. `origin` is the position of its lower left corner.
 
-    A `RuntimeWarning` says where `free_thresh` makes the grey free that map savers write for
-    unknown cells, as .25 does, in ROS as well. Raises `ImportError` without Pillow and PyYAML,
-    which the extra `robots` brings, and `ValueError` for a mode other than trinary and scale, an
-    origin that is turned, an entry that is no number, and where the resolution lacks. Use it with
-    maps of `slam_toolbox` or `map_saver`, and with a drawn plan.
+    A `RuntimeWarning` reports a `free_thresh`, such as .25, that makes the grey free that map
+    savers write for unknown cells, which happens in ROS as well. Raises `ImportError` without
+    Pillow and PyYAML, which the extra `robots` installs, and `ValueError` for a mode other than
+    trinary and scale, an origin that is rotated, an entry that is not a number, and a missing
+    resolution. Use it with maps of `slam_toolbox` or `map_saver`, and with a drawn plan.
     """
     from mpfjax.vision.files.frames import read_image
 

@@ -23,7 +23,7 @@ _IN_PLACE = 0.01  # metres: a shorter step has no direction, and is a turn, as i
 
 
 class OdometryMotion(Fitting):
-    """Odometry as a turn, a drive and a turn: Thrun, Burgard and Fox (2005), table 5.6.
+    """Odometry as a rotation, a translation and a rotation: Thrun et al. (2005), table 5.6.
 
     A step (forward, left, turn) is rot1, trans and rot2, to which normal noise is added with
 
@@ -31,8 +31,9 @@ class OdometryMotion(Fitting):
         var trans = alpha3 trans² + alpha4 (rot1² + rot2²)
         var rot2  = alpha1 rot2² + alpha2 trans²
 
-    As in AMCL, a drive backwards has a negative trans and no turn of π, and a step below 1 cm has
-    no direction: its noise is that of a turn alone. Each deviation is at least 10⁻⁴ (m, rad).
+    As in AMCL, a backward drive has a negative trans and no rotation of π, and a step below 1 cm
+    has no direction: its noise is that of a rotation alone. Each standard deviation is at least
+    10⁻⁴ (m, rad).
     """
 
     alpha1: Weight = eqx.field(kw_only=True, converter=to_array("alpha1"), default=0.2)
@@ -45,7 +46,7 @@ class OdometryMotion(Fitting):
     def from_noise(
         self, noise: Float[Array, "n 3"], poses: Poses, odometry: Float[Array, "3"]
     ) -> Poses:
-        """Poses after the step, made of standard normal noise."""
+        """Poses after the step, as a function of standard normal noise."""
         forward, left, turn = odometry
         way = jnp.where(forward < 0, -1, 1).astype(forward.dtype)
         trans, rot1 = way * jnp.hypot(forward, left), jnp.arctan2(way * left, way * forward)
@@ -119,11 +120,11 @@ def _steps(poses: np.ndarray) -> np.ndarray:
 
 @checked
 def interpolated_poses(times: Any, pose_times: Any, poses: Any) -> Float[np.ndarray, "s 3"]:
-    """Poses at the time stamps of scans, (s,), from those of odometry, (t,) and (t, 3).
+    """Poses at the time stamps of scans, (s,), from poses of odometry, (t,) and (t, 3).
 
-    Places are interpolated linearly, headings along the shorter turn. Raises `ValueError` for
-    times of poses that do not rise, and for scans before the first pose or after the last one. Use
-    it before `odometry_steps` where scans and odometry come at times of their own.
+    Positions are interpolated linearly, headings along the shorter turn. Raises `ValueError` for
+    times of poses that do not increase, and for scans before the first pose or after the last one.
+    Use it before `odometry_steps` if scans and odometry have separate time stamps.
     """
     rows, at = to_rows(3, "poses", poses), np.asarray(times, float)
     knots = np.asarray(pose_times, float)

@@ -1,4 +1,4 @@
-"""Where a robot is: the heaviest hypothesis, the others, and the probability that it is lost."""
+"""The pose of a robot: the heaviest hypothesis, the others, and the probability of being lost."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
@@ -19,16 +19,16 @@ _LEAST_WEIGHT = 1e-3  # of a hypothesis that is reported
 
 
 class PoseEstimate(NamedTuple):
-    """Where a robot is after a scan, as `follow` reports it.
+    """The pose of a robot after a scan, as reported by `follow`.
 
-    - `pose`: (x, y, heading) of the heaviest hypothesis: the mean of all that lies within the
+    - `pose`: (x, y, heading) of the heaviest hypothesis: the mean of all particles within the
       radius of its component's mean.
-    - `covariance`: (3, 3), of the same part of the distribution.
-    - `localised`: its probability, given that some hypothesis is right; see `localised`.
+    - `covariance`: (3, 3), of the same particles.
+    - `localised`: its probability, given that some hypothesis is correct; see `localised`.
     - `lost`: the probability that the robot is not there; see `lost`.
     - `other_poses`, `other_weights`: the means of the components beyond that radius and their
       mixture weights, the heaviest first, (k, 3) and (k,).
-    - `mixture`: all of it.
+    - `mixture`: the whole mixture.
     """
 
     pose: Float[np.ndarray, "3"]
@@ -42,10 +42,10 @@ class PoseEstimate(NamedTuple):
 
 @checked
 def localised(mixture: ParticleMixture, radius: Positive = 1.0) -> Float[Array, ""]:
-    """The share of the distribution within `radius` metres of the heaviest component's mean.
+    """The probability of the region within `radius` metres of the heaviest component's mean.
 
-    States are poses. It says how far the hypotheses agree, and not whether any is right: `lost`
-    knows both. Use it as the `collect` of a run.
+    States are poses. It measures how far the hypotheses agree, and not whether any is correct;
+    `lost` accounts for both. Use it as the `collect` of a run.
     """
     return jnp.sum(jnp.where(_near(mixture, radius), mixture.weights, 0.0))
 
@@ -60,21 +60,20 @@ def _near(mixture: ParticleMixture, radius: Any) -> Array:
 def lost(
     localised: Any, log_evidence_against_start: Any, probability: InnerShare = 1e-3
 ) -> Float[np.ndarray, "*runs t"]:
-    """The probability that the robot is not where the heaviest hypothesis says, at each step.
+    """The probability that the robot is not at the heaviest hypothesis, at each step.
 
         lost_t = 1 - localised_t (1 - q_t),   q_t / (1 - q_t) = o_t,
         o_t = (o_{t-1} + p) p(y_t | x ~ p_0) / p(y_t | y_1..y_{t-1}),   o_0 = p
 
-    q is the probability that all hypotheses are wrong, from the evidence that the alarm compares,
-    as of a change at an unknown time (Shiryaev 1963); its odds are at most e^10.
+    q is the probability that all hypotheses are wrong, from the evidence that the alarm evaluates,
+    for a change at an unknown time (Shiryaev 1963); its odds are at most e^10.
 
-    - `localised`: the share of the mass at the heaviest hypothesis, (t,) or (runs, t), see
-      `localised`.
-    - `log_evidence_against_start`: that of the run, or of the report of each step, of a filter with
+    - `localised`: the probability at the heaviest hypothesis, (t,) or (runs, t), see `localised`.
+    - `log_evidence_against_start`: from the run, or from the report of each step, of a filter with
       an alarm or restarts, of the same shape.
     - `probability`: p, that a robot is carried away between two scans.
 
-    Use it to stop a robot, or to let it look around: below .5 the pose is probably right. Raises
+    Use it to stop a robot, or to let it explore: below .5 the pose is probably correct. Raises
     `ValueError` for arrays of different shapes.
     """
     shares, evidences = np.asarray(localised, float), np.asarray(log_evidence_against_start, float)
@@ -120,19 +119,20 @@ def follow(
     radius: Positive = 1.0,
     probability: InnerShare = 1e-3,
 ) -> Iterator[PoseEstimate]:
-    """Where the robot is after each scan, as the scans come.
+    """The pose of the robot after each scan, as the scans arrive.
 
         for estimate in robots.follow(key, filter, pairs):
             print(estimate.pose, estimate.lost)
 
     - `filter`: of a `RobotModel`, with an alarm: `with_restarts` or `with_alarm`.
-    - `scans`: pairs (step, scan) in order, of any length: the odometry since the pair before, and
-      y_t. They are drawn one by one.
-    - `radius`: of what counts as the same place, metres; see `localised`.
+    - `scans`: pairs (step, scan) in order, of any length: the odometry since the previous pair, and
+      y_t. They are read one by one.
+    - `radius`: of what counts as the same position, metres; see `localised`.
     - `probability`: p of `lost`.
 
     Raises `ValueError` at the first scan for a filter without an alarm. Use it in a robot: the
-    program is compiled in the first steps, and all later ones take the same time, but for restarts.
+    program is compiled in the first steps, and all later ones take the same time, except for
+    restarts.
     """
     return _follow(key, filter, scans, radius, probability)
 

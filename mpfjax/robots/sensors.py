@@ -45,25 +45,25 @@ POSE = entries(
 
 
 class AbstractLaser(Fitting):
-    """A planar scanner: p(scan | pose, map) is the product over its beams, to a power.
+    """A planar scanner: p(scan | pose, map) is the product over its beams, raised to a power.
 
-    - `angles`: of the beams of a scan, (k,), counted from the scanner's own heading: `angle_min +
+    - `angles`: of the beams of a scan, (k,), relative to the scanner's heading: `angle_min +
       angle_increment * arange(k)` of ROS's `LaserScan`, in radians.
-    - `laser_max_range`: metres; a beam of this range or more met nothing, also an infinite one.
-    - `laser_min_range`: metres; a beam up to it counts as one that met nothing, as in AMCL.
-    - `max_beams`: how many are used, evenly spaced among those that say anything.
+    - `laser_max_range`: metres; a beam of at least this range, or an infinite one, hit nothing.
+    - `laser_min_range`: metres; a beam up to this range counts as one that hit nothing, as in AMCL.
+    - `max_beams`: how many are used, evenly spaced among the informative ones.
     - `exponent`: the power. Beams share the errors of the map and of the pose, so that their
-      product is far too sharp. None takes 10 over the number of beams that are used, at most 1: a
+      product is far too narrow. None is 10 over the number of beams that are used, at most 1: a
       scan is then worth ten independent beams.
     - `mount`: pose of the scanner in the robot's frame.
-    - `z_hit`, `z_rand`: weights of a beam that ends where the map says, and of any range at all;
+    - `z_hit`, `z_rand`: weights of a beam that ends where the map predicts, and of a uniform range;
       all weights are divided by their sum.
     - `sigma_hit`: the standard deviation of the first in metres.
 
-    A scan is (k,), in metres; beams that are NaN are left out, and so are those of -inf, which met
+    A scan is (k,), in metres; beams that are NaN are ignored, and so are those of -inf, which hit
     something too near to be measured (REP 117). Raises `ValueError` for angles beyond ±2π, and
-    warns where an exponent makes a scan worth more than thirty independent beams: few particles of
-    a diffuse prior survive it.
+    warns if an exponent makes a scan worth more than thirty independent beams: few particles of a
+    diffuse prior survive it.
     """
 
     angles: Annotated[Float[Array, " k"], RADIANS] = eqx.field(converter=to_array("angles"))
@@ -101,11 +101,11 @@ class AbstractLaser(Fitting):
         return self.log_scan(jnp.where(is_used[None], logs, -jnp.inf), is_used)
 
     def usable(self, scan: Float[Array, " k"], met: Bool[Array, " k"]) -> Bool[Array, " k"]:
-        """Which beams say anything."""
+        """Which beams are informative."""
         return ~jnp.isnan(scan) & (scan != -jnp.inf)
 
     def log_scan(self, logs: Beams, is_used: Bool[Array, " b"]) -> Float[Array, " n"]:
-        """log p of the scan, from those of its beams; those that are not used have -inf."""
+        """log p of the scan, from the log p of its beams; beams that are not used have -inf."""
         total = jnp.sum(jnp.where(is_used[None], logs, 0.0), axis=1)
         if self.exponent is not None:
             return self.exponent * total
@@ -128,7 +128,7 @@ class AbstractLaser(Fitting):
 
     @abc.abstractmethod
     def log_beams(self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid) -> Beams:
-        """log p of each beam from each pose of the scanner; one that met nothing has the most."""
+        """log p of each beam from each pose of the scanner, maximal for one that hit nothing."""
 
 
 class LikelihoodField(AbstractLaser):
@@ -136,23 +136,23 @@ class LikelihoodField(AbstractLaser):
 
         p = z_hit N(d; 0, sigma_hit²) + z_rand / laser_max_range
 
-    with d from the end of the beam to the nearest edge of a wall, and
-    `laser_likelihood_max_dist` where that is less, or the end is off the map. Beams that met
-    nothing say nothing, and others are used in their place.
+    with d the distance from the end of the beam to the nearest edge of a wall, but at most
+    `laser_likelihood_max_dist`, which is also used off the map. Beams that hit nothing are not
+    informative, and others are used instead.
 
     - `weighting`: "product" of p to the power `exponent`, or AMCL's "cubes": 1 + Σ p³, without the
-      factor 1 / (sigma_hit √(2π)) and the sum of the weights. Cubes are no likelihood: a scan then
-      hardly tells poses apart, and hypotheses and their masses follow no probability.
+      factor 1 / (sigma_hit √(2π)) and the sum of the weights. Cubes are not a likelihood: a scan
+      then hardly distinguishes poses, and mixture weights are not probabilities.
 
-    It is smooth, and takes a look-up per beam: use it first, and `AbstractLaser` says what its
-    other parameters are. It does not know that a beam cannot pass a wall.
+    It is smooth, and takes one look-up per beam: use it first. `AbstractLaser` describes the other
+    parameters. It ignores that a beam cannot pass through a wall.
     """
 
     laser_likelihood_max_dist: Positive = eqx.field(static=True, kw_only=True, default=2.0)
     weighting: Literal["product", "cubes"] = eqx.field(static=True, kw_only=True, default="product")
 
     def usable(self, scan: Float[Array, " k"], met: Bool[Array, " k"]) -> Bool[Array, " k"]:
-        """Which beams met anything."""
+        """Which beams hit anything."""
         return met
 
     def log_beams(self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid) -> Beams:
@@ -177,12 +177,12 @@ class BeamModel(AbstractLaser):
         p = z_hit N(z; z*, sigma_hit²) + z_short lambda_short exp(-lambda_short z) 1(z <= z*)
             + z_max 1(z = laser_max_range) + z_rand / laser_max_range 1(z < laser_max_range)
 
-    with z* the range that the map says, and the first two normalised on [0, laser_max_range] and
-    [0, z*]. `z_short` is the weight of what stands before the wall, people say, and `z_max` that of
-    beams that met nothing. `AbstractLaser` says what its other parameters are.
+    with z* the range that the map predicts, and the first two normalised on [0, laser_max_range]
+    and [0, z*]. `z_short` is the weight of obstacles in front of the wall, such as people, and
+    `z_max` the weight of beams that hit nothing. `AbstractLaser` describes the other parameters.
 
-    Use it where several places have walls at the same distances, but in other directions, or behind
-    other walls, with a map that is `tabulated`: it takes no longer than `LikelihoodField` then.
+    Use it if several poses have walls at the same distances, but in other directions, or behind
+    other walls, with a map that is `tabulated`: it then takes no longer than `LikelihoodField`.
     """
 
     z_short: Weight = eqx.field(kw_only=True, converter=to_array("z_short"), default=0.005)

@@ -81,11 +81,11 @@ def sample_trajectories(
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
     that does not exist or is empty, a run with restarts, and for "mcmc" if particles have no single
-    ancestors (an index below 0; both a RuntimeError within jit); a RuntimeError if no particle can
-    have moved to the next. If the backward weights degenerate, so that at some time fewer than a
-    tenth of the trajectories are distinct, a RuntimeWarning reports the fraction. Use it for
-    estimates of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but
-    has few distinct states at early times.
+    ancestors (an index below 0); a RuntimeError if no particle can have moved to the next. Within
+    a caller's jit, states are NaN in place of these errors. If the backward weights degenerate, so
+    that at some time fewer than a tenth of the trajectories are distinct, a RuntimeWarning reports
+    the fraction. Use it for estimates of the past. The genealogy of the particles
+    (`trace_ancestors`) is exact as well, but has few distinct states at early times.
     """
     model = filter.model if isinstance(filter, Filter) else filter
     if not isinstance(filter, Filter):

@@ -1,4 +1,4 @@
-"""Tuning of a filter's parameters by gradients, and their posterior."""
+"""Estimation of a filter's parameters by gradients, and their posterior."""
 
 from mpfjax.tuning.bijections import Interval as Interval
 from mpfjax.tuning.bijections import Positive as Positive

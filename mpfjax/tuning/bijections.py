@@ -1,4 +1,4 @@
-"""Maps between a parameter's domain and unconstrained numbers, in which optimisers step."""
+"""Maps between a parameter's domain and unconstrained coordinates, in which optimisers step."""
 
 import abc
 
@@ -16,19 +16,19 @@ class AbstractTransform(Checked):
 
     @abc.abstractmethod
     def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The parameter, or a stack of them, inside its domain whatever the real numbers are."""
+        """The parameter, or a stack of them, inside its domain for any real numbers."""
 
     @abc.abstractmethod
     def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The real numbers that give this parameter."""
+        """The real numbers that correspond to this parameter."""
 
     @abc.abstractmethod
     def contains(self, value: Float[np.ndarray, "..."]) -> bool:
-        """Whether every entry lies inside the domain."""
+        """Whether every entry is inside the domain."""
 
     @abc.abstractmethod
     def log_jacobian(self, reals: Float[Array, "..."]) -> Float[Array, ""]:
-        """log |det ∂x/∂u|, by which a density of x becomes one of u."""
+        """log |det ∂x/∂u|, which converts a density of x into one of u."""
 
 
 class Unconstrained(AbstractTransform):
@@ -55,7 +55,7 @@ class Positive(AbstractTransform):
     """exp: for scales; a step of the optimiser is then a relative change."""
 
     def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """exp u, no less than the least normal number and no more than the largest."""
+        """exp u, between the smallest normal number and the largest number."""
         limits = jnp.finfo(reals.dtype)
         # One step inside, so that rounding does not leave the range.
         ends = np.log([float(limits.tiny), float(limits.max)]).astype(reals.dtype)
@@ -100,11 +100,11 @@ class Interval(AbstractTransform):
         return jnp.clip(inside, first if low != 0 else tiny, last if high != 0 else -tiny)
 
     def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The logit of where it lies between the ends."""
+        """The logit of the relative position between the ends."""
         return jnp.log(value - self.low) - jnp.log(self.high - value)
 
     def contains(self, value: Float[np.ndarray, "..."]) -> bool:
-        """Whether all entries lie strictly between the ends."""
+        """Whether all entries are strictly between the ends."""
         return bool(((value > self.low) & (value < self.high)).all())
 
     def log_jacobian(self, reals: Float[Array, "..."]) -> Float[Array, ""]:

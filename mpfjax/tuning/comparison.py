@@ -1,4 +1,4 @@
-"""Models compared by their evidence, with the error of its estimate."""
+"""Comparison of models by their evidence, with the error of its estimate."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ Runs = SequentialPosterior | Sequence[SequentialPosterior | float] | np.ndarray
 
 @dataclass(frozen=True, repr=False)
 class Comparison:
-    """The evidence of several models, by name, the most likely model first."""
+    """The evidence of several models, by name, the most probable model first."""
 
     log_marginal_likelihoods: dict[str, float]
     """log p(y_1..y_t) of each, estimated."""
@@ -23,20 +23,20 @@ class Comparison:
 
     @property
     def differences(self) -> dict[str, float]:
-        """The evidence of the first less that of each: the log of their Bayes factor."""
+        """The log evidence of the first model minus that of each: the log of their Bayes factor."""
         best = max(self.log_marginal_likelihoods.values())
         return {name: best - value for name, value in self.log_marginal_likelihoods.items()}
 
     @property
     def difference_errors(self) -> dict[str, float]:
-        """Their standard errors."""
+        """The standard errors of the differences."""
         first, *others = self.errors
         best = self.errors[first]
         return {first: 0.0} | {name: float(np.hypot(best, self.errors[name])) for name in others}
 
     @property
     def probabilities(self) -> dict[str, float]:
-        """Of the models given the data, if all are equally probable before."""
+        """The posterior probabilities of the models, if all are equally probable a priori."""
         weights = np.exp([-difference for difference in self.differences.values()])
         return dict(zip(self.errors, (weights / weights.sum()).tolist(), strict=True))
 
@@ -55,12 +55,12 @@ def compare_evidence(models: Mapping[str, Runs]) -> Comparison:
 
     - `models`: by name, each a posterior of `smc2`, a list of posteriors of independent runs, or
       several estimates of log p(y_1..y_t), such as `monte_carlo(...).log_marginal_likelihood` of a
-      model without unknown parameters. All of the same observations, and each from keys of its own.
+      model without unknown parameters. All must be of the same observations, with separate keys.
 
-    Of several runs the evidence is the mean of their estimates, since each is unbiased, and its
-    error comes from their spread; of one posterior the error is `log_marginal_likelihood_error`.
+    For several runs the evidence is the mean of their estimates, because each is unbiased, and its
+    error follows from their spread; for one posterior the error is `log_marginal_likelihood_error`.
     Differences of independent estimates add their variances. Twice the standard error covers about
-    95% if it is below one half; take more samples or more runs until it is.
+    95% if it is below one half; use more samples or more runs until it is.
 
     Raises `ValueError` for fewer than two models, a single estimate without an error, estimates
     that are not finite, and posteriors of different numbers of observations.

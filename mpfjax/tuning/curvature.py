@@ -36,23 +36,23 @@ def standard_errors(
     transforms: Transforms = None,
     num_seeds: Count = 100,
 ) -> dict[str, np.ndarray] | None:
-    """Standard errors of a filter's parameters where they maximise the likelihood.
+    """Standard errors of a filter's parameters at the maximum of the likelihood.
 
     They are the roots of the diagonal of J I⁻¹ Jᵀ (the delta method). I is the observed information
-    in unconstrained numbers, and J the Jacobian of the parameters. I is found by central
+    in unconstrained coordinates, and J the Jacobian of the parameters. I is computed by central
     differences of the mean score, over about one standard error to each side, with the same seeds
-    on both sides. A few tries find that distance, starting from the size of the score, so the
+    on both sides. A few tries determine that distance, starting from the size of the score, so the
     parameters may have any units. The scores must be unbiased: build the filter with
-    `gradient="stop"`; otherwise there is a warning. The cost is one gradient of `num_seeds` runs,
-    and for each try two for each number; usually two tries, at most ten.
+    `gradient="stop"`; otherwise there is a warning. The computation takes one gradient of
+    `num_seeds` runs, and for each try two for each coordinate; usually two tries, at most ten.
 
-    Arguments are those of `fit`. Noise in I makes the errors too large rather than too small. A
-    warning says if there are too few seeds: if the standard error of one of the errors is more than
-    an eighth of it, by the delta method from what each seed adds to I.
+    The arguments are those of `fit`. Noise in I makes the errors too large rather than too small. A
+    warning is issued if there are too few seeds: if the standard error of one of the errors is more
+    than an eighth of it, by the delta method from the contribution of each seed to I.
 
     Returns None, with a warning, if I is not positive definite: away from a maximum, along a
-    direction that the data do not determine, or with too few seeds. Raises `ValueError` for what
-    `fit` does, fewer than one seed, and more than fifty numbers.
+    direction that the data do not determine, or with too few seeds. Raises `ValueError` as `fit`
+    does, and for fewer than one seed, and more than fifty coordinates.
     """
     problem = pose_evidence(filter, observations, parameters, transforms)
     warn_of_bias("standard_errors", problem)

@@ -104,22 +104,22 @@ def log_density(
     parameters: Parameters = None,
     transforms: Transforms = None,
 ) -> LogDensity:
-    """The posterior's log density in unconstrained numbers, for samplers of other libraries.
+    """The posterior's log density in unconstrained coordinates, for samplers of other libraries.
 
     `density(u, key)` is log p(θ) + log |∂θ/∂u| + log Ẑ(θ; key), with θ = `density.constrain(u)`.
     Start at `density.start`.
 
-    - With a fresh key for every proposal, and the value kept of the state that a chain is at, a
-      Metropolis sampler has exactly the posterior (Andrieu and Roberts 2009), as
-      `metropolis_hastings` has: log Ẑ must never be estimated again at the same state.
-    - With one key for all calls it is a fixed function of u, for samplers by gradient such as
-      NUTS. Their posterior then has the error of this one estimate, which falls as N grows. A
-      filter that resamples is not continuous in u: build it with `gradient="stop"`, and take many
+    - With a new key for every proposal, and a stored value for the current state of the chain, a
+      Metropolis sampler has exactly the posterior (Andrieu and Roberts 2009), like
+      `metropolis_hastings`: log Ẑ must never be estimated again at the same state.
+    - With one key for all calls it is a fixed function of u, for samplers by gradient such as NUTS.
+      Their posterior then has the error of this single estimate, which decreases as N grows. A
+      filter that resamples is not continuous in u: build it with `gradient="stop"`, and use many
       particles.
 
-    The arguments are those of `metropolis_hastings`. Raises `ValueError` where it does. Use it with
-    blackjax as `partial(density, key=key)`, with numpyro as
-    `potential_fn=lambda u: -density(u, key)`.
+    The arguments are those of `metropolis_hastings`. Raises `ValueError` in the same cases. Use it
+    with blackjax as `partial(density, key=key)`, with numpyro as `potential_fn=lambda u:
+    -density(u, key)`.
     """
     problem = pose_evidence(filter, observations, parameters, transforms)
     return LogDensity(problem, checked_prior(log_prior, problem))

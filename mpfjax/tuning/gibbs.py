@@ -49,8 +49,8 @@ Draw = Callable[[Key[Array, ""], PyTree, PyTree, Any], Mapping[str, Any]]
 class GibbsPosterior(PosteriorOfChains):
     """The chains of `particle_gibbs`, after their burn-in.
 
-    `accepted` is 1 where the parameters are drawn. What is counted where it was no number are the
-    `log_prior` and `log_joint` of a proposal, the numbers of `draw`, and densities in the
+    `accepted` is 1 if the parameters are drawn. Values that are not finite are counted for the
+    `log_prior` and `log_joint` of a proposal, the values of `draw`, and densities in the
     `conditional_filter`.
     """
 
@@ -61,7 +61,7 @@ class GibbsPosterior(PosteriorOfChains):
 
     @property
     def renewal_rates(self) -> Float[np.ndarray, " times"]:
-        """For each time, the share of steps in which the state changed."""
+        """For each time, the fraction of steps in which the state changed."""
         return self.renewed.mean(axis=(0, 1))
 
 
@@ -88,43 +88,44 @@ def particle_gibbs(
     """Sample p(θ, x_0, ..., x_t | y_1..y_t), parameters and trajectory in turn.
 
     Particle Gibbs (Andrieu, Doucet and Holenstein 2010, section 2.4.3). Given θ, a
-    `conditional_filter` renews the trajectory: it leaves p(x | y, θ) as it is for every N, also
-    where moves regroup. Given the trajectory, θ is either drawn, or moved by Metropolis steps on
+    `conditional_filter` renews the trajectory: it leaves p(x | y, θ) invariant for every N, also if
+    moves regroup. Given the trajectory, θ is either drawn, or moved by Metropolis steps on
 
         log p(θ) + log |∂θ/∂u| + log p(x_0 | θ) + Σ_t log D(x_t | x_{t-1}; θ) L(y_t | x_t; θ).
 
-    So the pair has exactly the posterior distribution, whatever the number of particles.
+    So the pair has exactly the posterior distribution, for any number of particles.
 
     - `draw`: a function `(key, trajectory, observations, model) -> {name: value}` that draws all
       parameters from p(θ | x, y), on their own scale. The trajectory's leaves are (t + 1, ...), of
-      one chain. `model` has the present parameters. Missing observations are there, as NaN.
-    - `log_prior`: in place of `draw`: a function of the parameters by name, as for
+      one chain. `model` has the current parameters. Missing observations are included, as NaN.
+    - `log_prior`: instead of `draw`: a function of the parameters by name, as for
       `metropolis_hastings`. The model then needs `log_transition` and `log_initial`.
     - `proposal_deviations`: of the Metropolis steps' random walk, as for `metropolis_hastings`;
-      there are five of them for one new trajectory.
-    - `collect`: a function of one trajectory that returns what to keep of it, such as
-      `lambda trajectory: trajectory[-1]`, or `lambda trajectory: None`. None keeps all.
+      there are five steps for each new trajectory.
+    - `collect`: a function of one trajectory that returns the part to store, such as `lambda
+      trajectory: trajectory[-1]`, or `lambda trajectory: None`. None stores all.
     - `observations`: one sequence, arrays or a `Series`. `parameters`, `transforms`: as for `fit`.
-      Parameters are usually the model's; those of a proposal have no posterior.
+      Parameters are usually the model's; parameters of a proposal have no posterior.
     - `num_chains`, `sample_prior`, `burn_in`, `thinning`, `checkpoint`: as for
-      `metropolis_hastings`. Each chain starts at a trajectory of its own. In the burn-in
-      the random walk learns its scale too, since the density given a trajectory has no noise: it
-      aims at accepting 44% of the Metropolis steps for one number, 23% for several. With `draw`
-      nothing is learned.
+      `metropolis_hastings`. Each chain starts at a separate trajectory. During the burn-in the
+      random walk also adapts its scale, because the density given a trajectory has no noise: it
+      aims at accepting 44% of the Metropolis steps for one coordinate, 23% for several. With `draw`
+      nothing is adapted.
 
-    The new trajectory is drawn by backward sampling, or of a model without `log_transition` by the
-    genealogy, see `conditional_filter`.
+    The new trajectory is drawn by backward sampling, or for a model without `log_transition` from
+    the genealogy, see `conditional_filter`.
 
     A proposal whose density is NaN or +inf is rejected. If the conditional filter meets such a
     density, the whole step is rejected. `num_invalid` counts both, with a warning. Ctrl-C returns
     the draws so far with a warning, if there are any. Raises `ValueError` for both or none of
     `draw` and `log_prior`, a draw of other names or shapes than the parameters, a list of
-    sequences, a checkpoint of other chains, and what `conditional_filter` and `fit` do;
-    `RuntimeError` where the start, or a hundred draws of the prior, have no likelihood.
+    sequences, a checkpoint of other chains, and as `conditional_filter` and `fit` do;
+    `RuntimeError` if the initial values, or a hundred draws of the prior, have zero likelihood.
 
-    Use it where the trajectory makes the parameters' distribution simple, or long sequences make
-    `metropolis_hastings` reject nearly all. If θ and the trajectory fix each other, as a small
-    noise of the dynamics does, steps are short and `metropolis_hastings` is better.
+    Use it if the distribution of the parameters given the trajectory is simple, or if long
+    sequences make `metropolis_hastings` reject nearly all proposals. If θ and the trajectory
+    determine each other, as with a small noise of the dynamics, steps are short and
+    `metropolis_hastings` is better.
     """
     if (draw is None) == (log_prior is None):
         raise ValueError("draw, log_prior: exactly one must be given")

@@ -1,4 +1,4 @@
-"""What happened, over the posterior of parameters and states: whole trajectories, or their ends."""
+"""Past states over the posterior of parameters and states: whole trajectories, or their ends."""
 
 from dataclasses import replace
 from functools import partial
@@ -47,29 +47,29 @@ class PosteriorTrajectories(NamedTuple):
 def posterior_trajectories(
     key: Key[Array, ""], posterior: Chains, num_trajectories: Count | None = None
 ) -> PosteriorTrajectories:
-    """Draw x_0, ..., x_t and new observations given y_1..y_t, the parameters integrated out.
+    """Draw x_0, ..., x_t and new observations given y_1..y_t, with the parameters integrated out.
 
     For each draw of θ there is one trajectory from p(x_0, ..., x_t | y_1..y_t, θ), and for each
-    state x_s one observation from p(y_s | x_s, θ): quantiles over draws are bands of what happened,
-    and of what could have been observed (a posterior predictive check).
+    state x_s one observation from p(y_s | x_s, θ): quantiles over draws are bands of the past
+    states, and of observations that could have been made (a posterior predictive check).
 
-    - of `metropolis_hastings`, the run whose Ẑ was accepted is made again with its key, once for
-      all draws that share it, and leaves one trajectory. The pair has the posterior distribution as
+    - for `metropolis_hastings`, the run whose Ẑ was accepted is repeated with its key, once for all
+      draws that share it, and yields one trajectory. The pair has the posterior distribution as
       exactly as θ alone, for any N (Andrieu, Doucet and Holenstein 2010, section 2.4.2);
-    - of `particle_gibbs`, the trajectories, which must be kept whole (`collect=None`);
-    - of `smc2`, each sample gets a filter over all observations anew, and the weight Ẑ of the new
-      one over Ẑ of its own (Chopin, Jacob and Papaspiliopoulos 2013, section 3.6): right as the
-      number of samples grows. The draws are one chain, resampled by these weights.
+    - for `particle_gibbs`, the trajectories, which must be stored completely (`collect=None`);
+    - for `smc2`, a new filter over all observations is run for each sample, with the weight of its
+      Ẑ over the Ẑ of the sample (Chopin, Jacob and Papaspiliopoulos 2013, section 3.6): correct as
+      the number of samples grows. The draws are one chain, resampled by these weights.
 
-    Trajectories are drawn by backward sampling, or of a model without `log_transition` by the
+    Trajectories are drawn by backward sampling, or for a model without `log_transition` from the
     genealogy.
 
     - `num_trajectories`: how many of each chain, evenly spaced; None is one for each draw of θ. A
-      few hundred do for bands, and each costs a run of the filter.
+      few hundred are enough for bands, and each requires a run of the filter.
 
-    Raises `ValueError` for trajectories that were not kept, a posterior given several sequences,
-    and a conditionally linear model. Use it for the past with its uncertainty;
-    `sample_trajectories` is for known parameters, and `posterior_predictive` for what comes next.
+    Raises `ValueError` for trajectories that were not stored, a posterior of several sequences, and
+    a conditionally linear model. Use it for the past with its uncertainty; `sample_trajectories` is
+    for known parameters, and `posterior_predictive` for the future.
     """
     key_paths, key_seen = jax.random.split(key)
     problem, values, paths = drawn_states(key_paths, posterior, num_trajectories, whole=True)

@@ -1,4 +1,4 @@
-"""A likelihood tuned on labels: the posterior of the label among candidate states."""
+"""Likelihoods tuned on labels: the posterior of the label among candidate states."""
 
 import equinox as eqx
 import jax
@@ -15,12 +15,13 @@ class LabelLikelihood(eqx.Module):
     """The conditional log likelihood of labels given their observations, for `maximise`.
 
     Use it for a likelihood that is not normalised over y, such as exp(-λ B²), on frames whose true
-    states are known. The marginal likelihood of a filter only rises as λ falls and has no maximum
-    in λ; this objective has one.
+    states are known. The marginal likelihood of a filter always increases as λ decreases and has no
+    maximum in λ; this objective has one.
 
     - `observations`: leading axis t.
     - `labels`: the true states: leaves (t, k, ...), k of them in each frame.
-    - `candidates`: rival states of each: leaves (t, k, n, ...), such as `transition_candidates`.
+    - `candidates`: alternative states for each: leaves (t, k, n, ...), such as
+      `transition_candidates`.
     """
 
     observations: PyTree
@@ -35,19 +36,19 @@ class LabelLikelihood(eqx.Module):
     def log_posteriors(self, model: AbstractStateSpaceModel) -> Float[Array, "t k"]:
         """log p(x* | y) / q(x*) of every label, by Monte Carlo over its candidates.
 
-        With candidates x_1..x_n ~ q, the prior that they are drawn from, and x_0 = x* the label,
+        With candidates x_1..x_n ~ q, the prior from which they are drawn, and x_0 = x* the label,
 
             log L(y | x*) - log (1 / (n + 1)) Σ_{i=0..n} L(y | x_i),
 
         is the log posterior density of the label relative to q. It is normalised over the state, so
         a factor of L that does not depend on the state cancels: conditional maximum likelihood (for
         tracking, Taycher, Demirdjian, Darrell and Shakhnarovich 2006). With the label in the sum it
-        is at most log(n + 1), and its mean over labels is a lower bound of the information that y
-        has on x* (van den Oord, Li and Vinyals 2018). If labels are right to a pixel only, the best
-        likelihood is about a pixel wide: λ has a finite best value.
+        is at most log(n + 1), and its mean over labels is a lower bound of the mutual information
+        of y and x* (van den Oord, Li and Vinyals 2018). If labels are accurate to a pixel only, the
+        best likelihood is about a pixel wide: λ has a finite best value.
 
-        Frames are taken one after the other and computed again for the derivative. So in memory
-        only the data grow with t.
+        Frames are processed one after the other and recomputed for the derivative, so only the data
+        grow with t in memory.
         """
 
         @jax.checkpoint
@@ -69,8 +70,8 @@ def transition_candidates(
 ) -> PyTree:
     """Draws from D(. | the label one frame before), for every frame but the first.
 
-    `labels` has leaves (t, k, ...), the result (t - 1, k, n, ...): rivals as a filter would meet
-    them. Raises `ValueError` for fewer than one candidate.
+    `labels` has leaves (t, k, ...), the result (t - 1, k, n, ...): alternatives that a filter would
+    meet. Raises `ValueError` for fewer than one candidate.
     """
     t, k = jax.tree.leaves(labels)[0].shape[:2]
     lead = (t - 1, k, num_candidates)

@@ -21,7 +21,7 @@ from mpfjax.tuning.walks import RandomWalk, checked_deviations, metropolis_step
 class Posterior(PosteriorOfChains):
     """The chains of `metropolis_hastings`, after their burn-in.
 
-    Densities that are counted where they were no numbers are a proposal's `log_prior` and
+    Values that are not finite are counted for a proposal's `log_prior` and
     `log_marginal_likelihood`.
     """
 
@@ -49,18 +49,18 @@ def metropolis_hastings(
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> Posterior:
-    """Sample p(θ | y_1..y_t) with the filter's estimate Ẑ(θ) in place of the likelihood.
+    """Sample p(θ | y_1..y_t) with the filter's estimate Ẑ(θ) instead of the likelihood.
 
     Particle marginal Metropolis-Hastings (Andrieu, Doucet and Holenstein 2010, section 2.4.2) on
-    pairs (u, key). u is θ in unconstrained numbers. A Gaussian random walk proposes u, and the key
-    is always new. The log density of a pair,
+    pairs (u, key). u is θ in unconstrained coordinates. A Gaussian random walk proposes u, and the
+    key is always new. The log density of a pair,
 
         log p(θ) + log |∂θ/∂u| + log Ẑ(θ; key),
 
-    is a function of the pair, and Ẑ is unbiased. So θ has exactly the posterior distribution,
-    whatever the number of particles. With too few particles, chains stay at one state for long.
-    Aim at a standard deviation of log Ẑ of about one (Doucet et al. 2015), and an acceptance of 10
-    to 40%. No derivative is taken, so `gradient` does not matter. Use it where a point and its
+    is a function of the pair, and Ẑ is unbiased. So θ has exactly the posterior distribution, for
+    any number of particles. With too few particles, chains remain at one state for a long time. Aim
+    at a standard deviation of log Ẑ of about one (Doucet et al. 2015), and an acceptance rate of 10
+    to 40%. No derivative is computed, so `gradient` does not matter. Use it if a point and its
     standard errors are not enough: with few observations, or posteriors that are skewed or have
     several modes.
 
@@ -68,21 +68,20 @@ def metropolis_hastings(
     - `num_steps`: after burn-in, of each chain.
     - `log_prior`: a function of the parameters by name, on their own scale, up to a constant; -inf
       where the prior is zero.
-    - `proposal_deviations`: of the random walk at first, in unconstrained numbers: one for all, or
-      by name, each a number or of the parameter's unconstrained shape. 2.4 / sqrt(d) standard
-      errors is a good start.
-
+    - `proposal_deviations`: initial standard deviations of the random walk, in unconstrained
+      coordinates: one for all, or by name, each a number or of the parameter's unconstrained shape.
+      2.4 / sqrt(d) standard errors is a good choice.
     - `num_chains`: 1 by default; they run under one vmap.
-    - `sample_prior`: where the chains start: a function of a key that draws one θ, the parameters
-      by name on their own scale. R-hat means something only for chains that start further apart
-      than the posterior is wide. None starts all at the filter's own parameters. A draw without
-      likelihood is drawn again.
-    - `burn_in`: steps before the others, of which none is kept; 0 by default. In them the random
-      walk learns the posterior's covariance from all chains (Haario, Saksman and Tamminen 2001).
-      Then it no longer changes, and the chains are Markov chains.
-    - `thinning`: k keeps every k-th step, for chains that are too long for memory.
-    - `checkpoint`: a `Checkpoint`, from whose file the same call goes on, also to a larger
-      `num_steps`. All else must be the same.
+    - `sample_prior`: the initial values of the chains: a function of a key that draws one θ, the
+      parameters by name on their own scale. R-hat is meaningful only for chains that start further
+      apart than the posterior is wide. None starts all at the filter's own parameters. A draw with
+      zero likelihood is drawn again.
+    - `burn_in`: steps before the others, none of which is stored; 0 by default. In them the random
+      walk adapts to the posterior's covariance, estimated from all chains (Haario, Saksman and
+      Tamminen 2001). Then it no longer changes, and the chains are Markov chains.
+    - `thinning`: k stores every k-th step, for chains that are too long for memory.
+    - `checkpoint`: a `Checkpoint`, from whose file the same call continues, also to a larger
+      `num_steps`. Everything else must be the same.
 
     A proposal with a prior or likelihood that is NaN or +inf is rejected, and counted in
     `num_invalid`, with a warning. Ctrl-C returns the draws so far with a warning, if there are any.
@@ -90,9 +89,9 @@ def metropolis_hastings(
     `log_prior` once.
 
     Raises `ValueError` for numbers below one, deviations that are not positive or of unknown
-    parameters, a filter that is `approximate`, a prior that is no number, a start or a draw of the
-    prior without one, a checkpoint of other chains, and what `fit` does; `RuntimeError` where the
-    start, or a hundred draws of the prior, have no likelihood.
+    parameters, a filter that is `approximate`, a prior that is not a number, initial values or
+    draws of the prior with a zero prior density, a checkpoint of other chains, and as `fit` does;
+    `RuntimeError` if the initial values, or a hundred draws of the prior, have zero likelihood.
     """
     problem = pose_evidence(filter, observations, parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())

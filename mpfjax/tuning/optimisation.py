@@ -77,43 +77,44 @@ def fit(
         log (1 / K Σ_k Ẑ_s(θ; k)),
 
     over K seeds k. Ẑ is unbiased, and the logarithm of its mean over seeds is biased far less than
-    log Ẑ of one seed, which lies below log Z by about half its variance. That variance depends on
-    θ, and over many sequences its effect does not average out. Build the filter with
+    log Ẑ of one seed, which is below log Z by about half its variance. That variance depends on θ,
+    and over many sequences its effect does not average out. Build the filter with
     `gradient="stop"`: its derivatives estimate the score. With the default, "none", the
-    optimisation ends somewhere else, however many particles there are, and a warning says so.
+    optimisation ends somewhere else, for any number of particles, and a warning is issued.
 
     The parameters of a proposal, such as a `NetworkProposal`, do not change Z. For them alone the
-    mean over seeds of log Ẑ is maximised, a lower bound of log Z that a better proposal raises;
-    of a tighter bound the gradient would have more noise relative to its size (Rainforth et al.
-    2018). "none" is right for them, and there is no warning.
+    mean over seeds of log Ẑ is maximised, a lower bound of log Z that a better proposal raises; the
+    gradient of a tighter bound would have more noise relative to its size (Rainforth et al. 2018).
+    "none" is correct for them, and there is no warning.
 
-    - `observations`: arrays or a `Series`; a list is several sequences, each run on its own.
-    - `optimizer`: an optimiser of optax. It steps in the unconstrained numbers of the transforms.
+    - `observations`: arrays or a `Series`; a list is several sequences, each run separately.
+    - `optimizer`: an optimiser of optax. It steps in the unconstrained coordinates of the
+      transforms.
     - `parameters`: what is tuned, by name: `{"sigma_y": lambda f: f.model.sigma_y}`. A node, such
-      as a network, stands for all its arrays. None is every floating point array of the model. A
-      named Python float becomes an array.
-    - `transforms`: by name, such as `Positive()` for a scale. A parameter without one has no
-      constraint.
+      as a network, means all its arrays. None is every floating-point array of the model. A named
+      Python float becomes an array.
+    - `transforms`: by name, such as `Positive()` for a scale. A parameter without one is
+      unconstrained.
     - `num_seeds`: K, the number of runs of each sequence in a step, under one vmap.
     - `batch`: the number of sequences in a step, in epochs of random order; None is all of them.
       Sequences in a batch have one shape. A `batch` that divides their number compiles once.
-    - `pooled`: whether the mean over seeds is that of Ẑ, or of log Ẑ. None is as above: true unless
-      all parameters are of proposals.
+    - `pooled`: whether Ẑ or log Ẑ is averaged over seeds. None is as above: true unless all
+      parameters are parameters of proposals.
     - `curvature_seeds`: the seeds for `standard_errors` at the end, in whole batches of
       `num_seeds`; 0 for none.
-    - `checkpoint`: a `Checkpoint`, from whose file the same call goes on, also to a larger
-      `num_steps`. All else must be the same: the filter and the observations to the bit, the
-      parameters, transforms, key, seeds and batches, and the steps that the optimiser takes.
+    - `checkpoint`: a `Checkpoint`, from whose file the same call continues, also to a larger
+      `num_steps`. Everything else must be the same: the filter and the observations to the bit, the
+      parameters, transforms, key, seeds and batches, and the steps of the optimiser.
 
-    A warning says so if fewer than two seeds count (`effective_seeds`), since log Ẑ varies much
-    from seed to seed: the bias is then about that of one seed.
+    A warning is issued if fewer than two seeds count (`effective_seeds`), because log Ẑ varies
+    strongly from seed to seed: the bias is then about that of one seed.
 
     If the log marginal likelihood or the gradient is not finite, the optimisation ends with the
     last good parameters, a warning, and the step in `stopped`. Ctrl-C ends it with a warning as
-    well. Raises `ValueError` for a parameter that is no floating point number, is static, starts
-    outside its domain or has no effect. Raises it for a checkpoint of another fit, naming what
-    differs, for one that is cut off or lacks an array, and where `run_filter` does. Raises
-    `RuntimeError` if the start itself is not finite.
+    well. Raises `ValueError` for a parameter that is not a floating-point number, is static, starts
+    outside its domain or has no effect. Raises it for a checkpoint of another fit, naming the
+    difference, for one that is truncated or lacks an array, and as `run_filter` does. Raises
+    `RuntimeError` if the initial value is not finite.
     """
     problem = pose_evidence(filter, observations, parameters, transforms)
     warn_of_bias("fit", problem)
@@ -168,20 +169,20 @@ def maximise(
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> TuningRun:
-    """Maximise any objective in some of a model's, or a filter's, parameters.
+    """Maximise any objective over some of a model's, or a filter's, parameters.
 
     Maximises the mean over seeds of `objective(key, model)`, a scalar that JAX can differentiate,
-    as `fit` does for the log marginal likelihood: same arguments, same checks, same report. Use it
-    for another objective, such as that of an unnormalised likelihood on labelled frames
+    as `fit` does for the log marginal likelihood, with the same arguments, checks and report. Use
+    it for another objective, such as that of an unnormalised likelihood on labelled frames
     (`LabelLikelihood`).
 
-    - `model`: the pytree that the objective is a function of.
+    - `model`: the pytree that is the argument of the objective.
     - `objective`: a function, or an `equinox.Module` with a `__call__`, whose arrays are the data.
-      An objective without randomness ignores its key, and needs one seed.
-    - `parameters`: as for `fit`, picked from `model`; None is every floating point array of it.
+      A deterministic objective ignores its key, and needs one seed.
+    - `parameters`: as for `fit`, selected from `model`; None is every floating-point array of it.
 
-    Raises what `fit` does for the same arguments, and `ValueError` for an objective that is not a
-    floating point scalar. For a `checkpoint` the objective must also be the same.
+    Raises errors as `fit` does for the same arguments, and `ValueError` for an objective that is
+    not a floating-point scalar. For a `checkpoint` the objective must also be the same.
     """
     problem = pose(model, objective, parameters, transforms)
     ascent = _Ascent("maximise", "value", key, problem, optimizer, num_seeds)

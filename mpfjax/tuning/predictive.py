@@ -1,4 +1,4 @@
-"""What comes next, over the posterior of parameters and states."""
+"""Future states and observations, over the posterior of parameters and states."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from mpfjax.tuning.happened import Chains, drawn_states
 
 
 class Predictive(NamedTuple):
-    """Draws of what comes next, all of equal weight."""
+    """Draws of future states and observations, all of equal weight."""
 
     states: PyTree
     """x_{t+1}, ..., x_{t+k}, leaves (chains, draws, k, ...)."""
@@ -33,30 +33,30 @@ def posterior_predictive(
     num_trajectories: Count | None = None,
     inputs: PyTree = None,
 ) -> Predictive:
-    """Draw the next k states and observations given y_1..y_t, parameters and states integrated out.
+    """Draw the next k states and observations, with parameters and states integrated out.
 
     For each draw of θ there is one of x_t given θ, then the model's own steps and observations:
 
         p(y_{t+1}, ..., y_{t+k} | y_1..y_t)
             = ∫ p(θ, x_t | y_1..y_t) p(x_{t+1}, y_{t+1}, ..., x_{t+k}, y_{t+k} | θ, x_t).
 
-    The pair (θ, x_t) has the posterior distribution as exactly as θ alone has, for any N:
+    The pair (θ, x_t) has the posterior distribution as exactly as θ alone, for any N:
 
-    - of `metropolis_hastings`, x_t is a particle of the run whose Ẑ was accepted (Andrieu, Doucet
-      and Holenstein 2010, section 2.4.2), which is made again with its key, once for all draws
-      that share it;
-    - of `particle_gibbs`, the end of the trajectory, which must be kept whole (`collect=None`);
-    - of `smc2`, a particle of the sample's own filter. There are as many draws as samples, as one
+    - for `metropolis_hastings`, x_t is a particle of the run whose Ẑ was accepted (Andrieu, Doucet
+      and Holenstein 2010, section 2.4.2), which is repeated with its key, once for all draws that
+      share it;
+    - for `particle_gibbs`, the end of the trajectory, which must be stored completely
+      (`collect=None`);
+    - for `smc2`, a particle of the sample's own filter. There are as many draws as samples, as one
       chain, resampled by their weights.
 
-    - `num_trajectories`, as for `posterior_trajectories`: a few hundred of each chain do for
-      bands, and of `metropolis_hastings` each costs a run of the filter.
+    - `num_trajectories`, as for `posterior_trajectories`: a few hundred of each chain are enough
+      for bands, and for `metropolis_hastings` each requires a run of the filter.
     - `inputs`: u_{t+1}, ..., u_{t+k}, as for `run_filter`.
 
     Raises `ValueError` for a model without `sample_observation(key, states)`, for trajectories that
-    were not kept, and for a posterior given several sequences.
-    Use it for forecasts that count all that is not known; `forecast` is for known parameters, and
-    `posterior_trajectories` for what happened.
+    were not stored, and for a posterior of several sequences. Use it for forecasts that include all
+    uncertainty; `forecast` is for known parameters, and `posterior_trajectories` for the past.
     """
     problem: Any = posterior.problem
     require(problem.tree.model, "sample_observation", "posterior_predictive")

@@ -63,17 +63,17 @@ class SequentialPosterior:
 
     @property
     def log_marginal_likelihood_error(self) -> float:
-        """Its standard error, from this one run; NaN where too few families are left for one.
+        """Its standard error, from this one run; NaN if too few families are left for one.
 
         Samples that descend from one draw of the prior are a family. From the families' weights S_e
         the relative variance of the evidence is (Lee and Whiteley 2018, equation 8)
 
             1 - n / (n - 1) (m / (m - 1))^k (1 - Σ_e S_e²),
 
-        for n samples that were resampled k times to m chains; it becomes an error of the logarithm
-        as if the evidence were lognormal. With f families, the error is itself uncertain by about
-        1 / sqrt(2 f). Where fewer than ten are left, take more samples, or several runs in
-        `compare_evidence`.
+        for n samples that were resampled k times to m chains; it is converted to an error of the
+        logarithm as if the evidence were lognormal. With f families, the error itself has an
+        uncertainty of about 1 / sqrt(2 f). If fewer than ten are left, use more samples, or several
+        runs in `compare_evidence`.
         """
         run, _ = cast(tuple[_Run, State], self._goes_on)
         shares = np.bincount(self.families, self.weights.astype(float))
@@ -88,7 +88,7 @@ class SequentialPosterior:
 
     @property
     def weights(self) -> Float[np.ndarray, " samples"]:
-        """Of the samples; they sum to one."""
+        """The weights of the samples; they sum to one."""
         return np.exp(self.log_weights)
 
     def mean(self, name: str) -> np.ndarray:
@@ -97,7 +97,7 @@ class SequentialPosterior:
 
     @property
     def filters(self) -> tuple[Problem, Series, Float[np.ndarray, " samples"]]:
-        """The problem with the filters' N, the data that they have seen, and log Ẑ of each."""
+        """The problem with the filters' N, the data processed so far, and log Ẑ of each."""
         run, state = cast(tuple[_Run, State], self._goes_on)
         samples, _, num_particles, _ = state.carry
         seen = jax.tree.map(lambda leaf: leaf[: state.step], run.series)
@@ -107,7 +107,8 @@ class SequentialPosterior:
     def resampled(self, rows: PyTree) -> PyTree:
         """The rows of as many samples of equal weight (systematic), as of one chain: (1, n, ...).
 
-        Their order is without meaning: in their own, copies would look like a chain that sticks.
+        Their order is meaningless: in their original order, copies would look like a chain that
+        sticks.
         """
         num, cumulative = len(self.weights), np.cumsum(self.weights, dtype=float)
         quantiles = (np.arange(num) + 0.5) / num * cumulative[-1]
@@ -116,7 +117,7 @@ class SequentialPosterior:
         return jax.tree.map(lambda leaf: leaf[draws][None], rows)
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """By parameter, or number of one: mean, standard deviation and quantiles.
+        """By parameter, or component of one: mean, standard deviation and quantiles.
 
         It prints as a table.
         """
@@ -133,13 +134,13 @@ class SequentialPosterior:
         return table(heading + (f"; {self.stopped}" if self.stopped else ""), self.summary())
 
     def extend(self, observations: PyTree, *, progress: bool = True) -> "SequentialPosterior":
-        """The posterior after further observations: the one of all observations at once.
+        """The posterior after further observations, equal to one run on all observations at once.
 
-        - `observations`: those that come next, arrays or a `Series`, with a leading axis t. Of a
+        - `observations`: the next ones, arrays or a `Series`, with a leading axis t. For a
           posterior that was stopped, those after its last increment.
 
-        This posterior stays as it is. Raises `ValueError` for observations of other shapes or
-        types, and what `smc2` does. Use it as observations come in.
+        This posterior does not change. Raises `ValueError` for observations of other shapes or
+        types, and as `smc2` does. Use it as observations arrive.
         """
         run, state = cast(tuple[_Run, State], self._goes_on)
         return run.followed_by(state.step, observations, progress).posterior(state)
@@ -161,44 +162,44 @@ def smc2(
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> SequentialPosterior:
-    """Sample p(θ | y_1..y_s) for s = 1, ..., t: particles of θ, each with a filter of its own.
+    """Sample p(θ | y_1..y_s) for s = 1, ..., t: particles of θ, each with its own filter.
 
-    SMC² (Chopin, Jacob and Papaspiliopoulos 2013). All filters take one observation at a time,
+    SMC² (Chopin, Jacob and Papaspiliopoulos 2013). All filters process one observation at a time,
     under one vmap, and every θ is weighted by its filter's increment of Ẑ. If the effective sample
-    size of the θs falls below half of their number, they are resampled together with their
-    filters. Then each makes steps of particle marginal Metropolis-Hastings: a Gaussian step in
-    unconstrained numbers u, a new filter over all observations so far, accepted by the ratio of
-    prior times Ẑ. The covariance of these steps is that of the weighted θs times 2.38² / d. Since Ẑ
-    is unbiased, the weighted θs are samples of the posterior as `num_samples` grows, for any number
-    of particles in the filters. The evidence of the model, with θ integrated out, comes with it.
+    size of the θs falls below half of their number, they are resampled together with their filters.
+    Then each makes steps of particle marginal Metropolis-Hastings: a Gaussian step in unconstrained
+    coordinates u, a new filter over all observations so far, accepted by the ratio of prior times
+    Ẑ. The covariance of these steps is that of the weighted θs times 2.38² / d. Because Ẑ is
+    unbiased, the weighted θs are samples of the posterior as `num_samples` grows, for any number of
+    particles in the filters. The evidence of the model, with θ integrated out, is estimated too.
 
-    - `num_samples`: how many θs there are. Memory is that of as many filters.
+    - `num_samples`: the number of θs. Memory is that of as many filters.
     - `sample_prior`: a function of a key that draws one θ, the parameters by name on their own
       scale. `log_prior`: its density, up to a constant, as for `metropolis_hastings`.
     - `num_moves`: Metropolis steps in each rejuvenation. Of the θs, num_samples / (num_moves + 1)
-      are resampled, and all states of their chains are kept (waste-free, Dau and Chopin 2022),
-      which costs less for the same number of samples than to keep the ends of chains alone.
-    - `max_particles`: where given, N is doubled after moves that accept less than a fifth, as long
-      as it stays below this: each θ gets a filter of 2N particles, and the weight Ẑ_2N / Ẑ_N
-      (section 3.6 there, the exchange step by importance sampling). Longer sequences need larger
-      N. Each N compiles its own programs.
-    - `checkpoint`: a `Checkpoint`, from whose file the samples go on, also to more observations
-      than those that it has seen. All else must be the same.
-    - `observations`: one sequence, arrays or a `Series`; `SequentialPosterior.extend` takes those
-      that come later. `parameters`, `transforms`: as for `fit`.
+      are resampled, and all states of their chains are retained (waste-free, Dau and Chopin 2022),
+      which takes less time for the same number of samples than retaining only the ends of the
+      chains.
+    - `max_particles`: if given, N is doubled after moves that accept less than a fifth, as long as
+      it stays below this: each θ receives a filter of 2N particles, and the weight Ẑ_2N / Ẑ_N
+      (section 3.6 there, the exchange step by importance sampling). Longer sequences need larger N.
+      Each N compiles its own programs.
+    - `checkpoint`: a `Checkpoint`, from whose file the samples continue, also to more observations
+      than so far. Everything else must be the same.
+    - `observations`: one sequence, arrays or a `Series`; `SequentialPosterior.extend` processes
+      later ones. `parameters`, `transforms`: as for `fit`.
 
-    A θ whose likelihood is NaN or +inf gets the weight zero, a proposal with such a prior or
+    A θ whose likelihood is NaN or +inf receives weight zero, a proposal with such a prior or
     likelihood is rejected, and `num_invalid` counts them, with a warning. Ctrl-C, and an
-    observation for which no θ has any likelihood, end it with a warning and the posterior before
-    that.
+    observation for which every θ has zero likelihood, end it with a warning and the posterior
+    before that.
 
     Raises `ValueError` for a filter that is `approximate`, numbers below one, `num_samples` that
     `num_moves` + 1 does not divide, draws of the prior of other names, shapes or domains than the
-    parameters or where its density is not finite, a list of sequences, a checkpoint of other
-    samples, and what `fit` does; `RuntimeError`
-    where no θ has any likelihood at the first observation. Use it to follow a posterior in time,
-    for posteriors with several modes, and to compare models; `metropolis_hastings` is simpler where
-    only the last posterior is wanted.
+    parameters or with a density that is not finite, a list of sequences, a checkpoint of other
+    samples, and as `fit` does; `RuntimeError` if every θ has zero likelihood at the first
+    observation. Use it to follow a posterior in time, for posteriors with several modes, and to
+    compare models; `metropolis_hastings` is simpler if only the last posterior is needed.
     """
     size = num_moves + 1
     if num_samples % size:

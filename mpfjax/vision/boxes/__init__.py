@@ -1,1 +1,1 @@
-"""Boxes drawn in the first frame: models, moves and recipes to follow them by colour."""
+"""Boxes drawn in the first frame: models, moves and presets to follow them by colour."""

@@ -31,12 +31,12 @@ PAPER_VARIANCES = (2.5, 1.5, 0.05, 0.05)
 
 
 class BoxState(eqx.Module):
-    """The place and size of a box, and the reference box that it is compared with.
+    """The position and size of a box, and the reference box with which it is compared.
 
     - `box`: (x, y, s_x, s_y), the centre in pixels and the size in units of the reference box.
-    - `reference`: r, the reference box it is compared with, in [0, number of references).
-    - `previous`: the memory of second-order dynamics, as their `remembered` gives it: the box one
-      frame before.
+    - `reference`: r, the index of the reference box, in [0, number of references).
+    - `previous`: the memory of second-order dynamics, as returned by their `remembered`: the box
+      one frame before.
     - `appearance`: the histograms that a `LearnedColourModel` has learned, (n, parts, channels,
       bins); None for other models.
     """
@@ -124,11 +124,11 @@ class ColourModel(AbstractBoxModel):
     `HSVColours` histogram (eqs. 1 to 3) and an `Autoregression` (eq. 4). Two extensions are in
     neither paper, and off by default:
 
-    - several references: r, the reference that a particle is compared with, is part of the state,
-      so that the recursion stays exact. x_0 is spread equally over all references. r never changes,
-      or is drawn again with a small probability in every frame, for objects that change their
+    - several references: r, the reference with which a particle is compared, is part of the state,
+      so that the recursion remains exact. x_0 is distributed equally over all references. r never
+      changes, or is redrawn with a small probability in every frame, for objects that change their
       appearance;
-    - boxes cut into bands from top to bottom, whose B² are averaged, so that a shirt is not
+    - boxes divided into bands from top to bottom, whose B² are averaged, so that a shirt is not
       confused with trousers; and weights of colours: a colour has more weight the larger its share
       in a reference box is, compared with the surroundings of the box. Grass in a box then has
       little weight.
@@ -143,14 +143,13 @@ class ColourModel(AbstractBoxModel):
       bins).
     - `dynamics`: of (x, y, s_x, s_y), in pixels for x and y and in units of the reference box for
       s_x and s_y; its parameters have a leading axis k.
-    - `initial_deviations`: of x_0, (k, 4), in the same units.
+    - `initial_deviations`: standard deviations of x_0, (k, 4), in the same units.
     - `sigma`: σ, the width of the likelihood.
     - `colours`: the bins of the histograms.
-    - `switch_probability`: the probability, in each frame, that r is drawn again from all
-      references.
-    - `contrast`: how much the log-likelihood gains if the areas at both sides of a box, half a
-      width each, do not have the reference's colours. 0 uses the box alone, as in the paper. A box
-      that is too large to be counted together with its sides gains nothing.
+    - `switch_probability`: the probability, in each frame, that r is redrawn from all references.
+    - `contrast`: how much the log-likelihood increases if the areas at both sides of a box, half a
+      width each, do not have the reference's colours. 0 uses only the box, as in the paper. A box
+      that is too large to be counted together with its sides has no increase.
     - `wide_counts`: count pixels in 32 bits; see `integral_histogram`. Without it, a box, or with
       `contrast` a box with its sides, may have at most 65 535 pixels.
     """
@@ -185,9 +184,9 @@ class ColourModel(AbstractBoxModel):
     ) -> "ColourModel":
         """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
 
-        - `colours`: the bins of the histograms; None takes `RGBColours()`.
-        - `deviations`: of x_0 and of the random walk, (4,) or one row a box; None takes the
-          paper's, the roots of (2.5, 1.5, 0.05, 0.05).
+        - `colours`: the bins of the histograms; None is `RGBColours()`.
+        - `deviations`: standard deviations of x_0 and of the random walk, (4,) or one row per box;
+          None is the paper's, the roots of (2.5, 1.5, 0.05, 0.05).
         - `dynamics`: instead of the random walk; one for all boxes, or with a row for each.
         - `num_parts`: bands from top to bottom.
         - `weigh_colours`: weight each colour by its share in the box relative to its share in the
@@ -235,13 +234,13 @@ class ColourModel(AbstractBoxModel):
         return -0.5 * distances / self.sigma**2
 
     def prepare_observation(self, observation: Seen) -> IntegralHistogram:
-        """The frame's integral histogram; a model of several objects builds it only once."""
+        """The frame's integral histogram; a model of several objects computes it only once."""
         if isinstance(observation, IntegralHistogram):
             return observation
         return integral_histogram(observation, self.colours, self.wide_counts)
 
     def counts(self, observation: Seen, states: BoxState) -> tuple[Histograms, Histograms | None]:
-        """Pixels of each colour in each box, and at its sides where `contrast` is positive."""
+        """Pixels of each colour in each box, and at its sides if `contrast` is positive."""
         num_parts = self.references.shape[1]
         observation, boxes = self.prepare_observation(observation), self.boxes(states)
         counts = observation.counts(boxes, num_parts)

@@ -1,4 +1,4 @@
-"""Boxes drawn in the first frame, followed: one track for each."""
+"""Boxes drawn in the first frame and followed: one track each."""
 
 import itertools
 from collections.abc import Generator, Iterable
@@ -34,14 +34,14 @@ def follow_boxes(
 ) -> Generator[Tracks, None, None]:
     """Follow boxes (x, y, w, h) of the first frame by their colours: yields `Tracks`, k rows each.
 
-    Row j has the identity j + 1. It is the most probable place of box j under the recipe "objects"
-    of `PRESETS`: the mean of the heaviest of the components that stand for it. An object without
-    any component left has the identity 0. There are no detections: `confirmed` says whether the
-    object has a component, and `unseen` is 0.
+    Row j has the identity j + 1. It is the most probable position of box j under the preset
+    "objects" of `PRESETS`: the mean of the heaviest of the components that represent it. An object
+    without any component left has the identity 0. There are no detections: `confirmed` reports
+    whether the object has a component, and `unseen` is 0.
 
-    - `frames`: as for `track`; the boxes, top-left corner first, in pixels, lie in the first. One
-      that is None is predicted.
-    - `key`: of the random numbers; None takes `jax.random.key(0)`.
+    - `frames`: as for `track`; the boxes, top-left corner first, in pixels, are in the first. A
+      frame that is None is predicted.
+    - `key`: of the random numbers; None is `jax.random.key(0)`.
     - `first`: the number of the first frame.
 
     Raises `ValueError` for no boxes, for boxes without area or outside the first frame, and for

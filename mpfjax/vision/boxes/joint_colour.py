@@ -42,24 +42,24 @@ def joint_colour_model(
         L(y | x^j) ∝ exp(-λ d²),  x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t
 
     d² is the squared Bhattacharyya distance of HSV histograms, summed over the P bands into which a
-    box is cut from top to bottom, as in Pérez, Hue, Vermaak and Gangnet (2002), where λ is also 20.
-    Each object has a `ColourModel`, which takes the mean over bands, so that its σ² is 1 / (2 λ P).
-    The paper has one scale α; here width and height have a scale each. An observation is an RGB
-    frame for all objects. Its integral histogram is built once in each step, and under
+    box is divided from top to bottom, as in Pérez, Hue, Vermaak and Gangnet (2002), where λ is 20
+    as well. Each object has a `ColourModel`, which averages over bands, so that its σ² is 1 / (2 λ
+    P). The paper has one scale α; here width and height have separate scales. An observation is an
+    RGB frame for all objects. Its integral histogram is computed once in each step, and under
     `monte_carlo` once for all runs.
 
-    - `boxes`: (x, y, w, h), top-left corner first, where the objects start, and where their
-      templates are in `frame`.
+    - `boxes`: (x, y, w, h), top-left corner first, the initial positions of the objects and of
+      their templates in `frame`.
     - `lambda_`: λ.
     - `num_parts`: bands.
-    - `colours`: the bins of the histograms; None takes `HSVColours()`.
+    - `colours`: the bins of the histograms; None is `HSVColours()`.
     - `deviations`: σ of x and y in pixels and of the scales of width and height; also those of x_0.
     - `templates`: (frame, box) for an object whose template is in another frame, by its index.
-    - `interaction`: that of `MultiObjectModel`, between `BoxState`s.
+    - `interaction`: as in `MultiObjectModel`, between `BoxState`s.
 
     Raises `ValueError`, with the name of the argument, for no boxes, a box without area or outside
-    its frame, a key of `templates` that is no object's index, and numbers that are not positive.
-    Use it where each object has colours of its own.
+    its frame, a key of `templates` that is not an object's index, and numbers that are not
+    positive. Use it if each object has distinct colours.
     """
     boxes = to_rows(4, "boxes", boxes)
     # σ of exp(-(mean of d²) / 2σ²) for exp(-λ (sum of d²)).

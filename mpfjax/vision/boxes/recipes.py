@@ -1,9 +1,9 @@
-"""Recipes for tracking boxes in video by their colours: a PF and an MPF, ready to run.
+"""Presets for tracking boxes in video by their colours: a PF and an MPF, ready to run.
 
-Each recipe takes the first frame and a box for each object. It returns two filters with the same
-model and the same initial particles: a particle filter of 200 particles, and a mixture particle
-filter of at most 10 components of 20. "objects" has twice as many particles, and for more than
-three objects more of both, see `most_components`. `PRESETS` has the recipes by name.
+Each preset is a function of the first frame and a box for each object. It returns two filters with
+the same model and the same initial particles: a particle filter of 200 particles, and a mixture
+particle filter of at most 10 components of 20. "objects" has twice as many particles, and for more
+than three objects more of both, see `most_components`. `PRESETS` has the presets by name.
 """
 
 from typing import Any

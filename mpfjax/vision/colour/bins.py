@@ -1,4 +1,4 @@
-"""The bins into which a colour histogram sorts pixels."""
+"""The bins of a colour histogram."""
 
 import abc
 from typing import Any
@@ -34,7 +34,7 @@ class AbstractColours(Checked):
 
 
 class RGBColours(AbstractColours):
-    """Red, green and blue on their own, each in `num_bins` equal bins.
+    """Red, green and blue separately, each in `num_bins` equal bins.
 
     Vermaak et al. (2003), section 5.2. Raises `ValueError` for a number of bins below 1.
     """
@@ -52,13 +52,13 @@ class RGBColours(AbstractColours):
 
 
 class HSVColours(AbstractColours):
-    """Hue and saturation together, and the value of pixels with little colour.
+    """Hue and saturation jointly, and the value of pixels with little colour.
 
     N = N_h N_s + N_v bins in one histogram, Lin et al. (2012), section 2.1, after Pérez, Hue,
     Vermaak and Gangnet (2002). A pixel with a saturation of at least `least_saturation` and a value
     of at least `least_value` (both in [0, 1]) is counted in one of N_h N_s bins of hue and
     saturation. The hue of any other pixel is unreliable: the pixel is counted in one of N_v bins of
-    value. Use it where the light changes, or where one histogram should replace three.
+    value. Use it if the illumination changes, or if one histogram should replace three.
 
     Raises `ValueError` for a number of bins below 1 and thresholds outside [0, 1].
     """
@@ -80,7 +80,7 @@ class HSVColours(AbstractColours):
         return self.num_hues * self.num_saturations + self.num_values
 
     def bins(self, frame: UInt8[Any, "h w 3"]) -> Int[Any, "h w 1"]:
-        """Hue N_s + saturation where there is colour, N_h N_s + value where there is not."""
+        """Hue N_s + saturation if there is colour, N_h N_s + value otherwise."""
         hue, saturation, value = hue_saturation_value(frame)
         coloured = (saturation >= self.least_saturation) & (value >= self.least_value)
         colour = _bin(hue, self.num_hues) * self.num_saturations

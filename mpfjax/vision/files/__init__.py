@@ -1,1 +1,1 @@
-"""Frames, boxes, truth and pictures: what is read and written."""
+"""Reading and writing of frames, boxes, ground truth and pictures."""

@@ -1,4 +1,4 @@
-"""Boxes as users and MOTChallenge files write them: (x, y) of the top-left corner, w, h."""
+"""Boxes in the form of MOTChallenge files: (x, y) of the top-left corner, w, h."""
 
 import codecs
 import csv
@@ -72,12 +72,12 @@ def top_left(boxes: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k n"]:
 def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     """Read a MOTChallenge file into rows (frame, id, x, y, w, h), (x, y) the top-left corner.
 
-    Frames count from 1. Every row is read, and further columns are ignored. Columns may be parted
-    by tabs, semicolons or blanks as well; comments, and a header that names these columns, are left
-    out. For a ground truth, where flags and classes say which rows count, use `read_truth`. Raises
-    `ValueError` for a line that cannot be read, with the file and the line, and for a file without
-    any box. Warns where the seventh column is that of a ground truth of which some rows do not
-    count.
+    Frames count from 1. Every row is read, and further columns are ignored. Columns may also be
+    separated by tabs, semicolons or blanks; comments, and a header that names these columns, are
+    skipped. For a ground truth, in which flags and classes determine which rows count, use
+    `read_truth`. Raises `ValueError` for a line that cannot be read, with the file and the line,
+    and for a file without any box. Warns if the seventh column is that of a ground truth in which
+    some rows do not count.
     """
     rows = list(read_rows(path, TRACK_FORM, TRACK_COLUMNS, least_id=0).values())
     flags = [row[6] for row in rows]
@@ -95,12 +95,12 @@ def read_detections(
     """Read a MOTChallenge file of detections into rows (frame, id, x, y, w, h, score).
 
     The id, -1 in such files, has no meaning. For a file of six columns, without scores, the result
-    has six columns too. With `with_classes` the eighth column is the class, a whole number, 0 for
-    none, and the result has eight. With `points` the rows are (frame, id, x, y), and a score and a
-    class where there are more columns. Separators, comments and headers are those of `read_tracks`.
-    Raises `ValueError` with the file and the line for a row that cannot be parsed, holds a number
-    that is not finite, lies in a frame before 1, has a score where other rows have none, or a class
-    that is none; and for a file without any detection.
+    has six columns too. With `with_classes` the eighth column is the class, an integer, 0 for none,
+    and the result has eight. With `points` the rows are (frame, id, x, y), and a score and a class
+    if there are more columns. Separators, comments and headers are as in `read_tracks`. Raises
+    `ValueError` with the file and the line for a row that cannot be parsed, has a number that is
+    not finite, is in a frame before 1, has a score if other rows have none, or an invalid class;
+    and for a file without any detection.
     """
     width, columns = 7, range(6, 11)
     form = "frame,id,x,y,w,h,score and up to three more columns, as the lines before it"
@@ -118,12 +118,12 @@ def read_detections(
 
 
 def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows columns"]) -> None:
-    """Write rows (frame, id, x, y, w, h), and a score and a class where there are eight columns.
+    """Write rows (frame, id, x, y, w, h), and a score and a class if there are eight columns.
 
-    They are written in the order of the frames, by the ending of `path`: `.json` in the form of
-    COCO, with a `track_id` for each annotation; `.csv` with a header; any other in that of
-    MOTChallenge. Raises `ValueError` for rows that `read_tracks` could not read: rows that are not
-    six or eight finite numbers, or with a frame, an id or a class that is not a whole number, from
+    They are written in the order of the frames, and the ending of `path` determines the format:
+    `.json` is COCO's, with a `track_id` for each annotation; `.csv` has a header; any other is
+    MOTChallenge's. Raises `ValueError` for rows that `read_tracks` could not read: rows that are
+    not six or eight finite numbers, or with a frame, an id or a class that is not an integer, from
     1, 0 and 0 on.
     """
     width = 8 if np.shape(rows)[-1:] == (8,) else 6

@@ -1,7 +1,7 @@
 """Drawing on RGB frames by Pillow: boxes with their numbers.
 
-Coordinates are in pixels; the centre of the first pixel is at (0.5, 0.5). What is drawn covers
-whole pixels, which is a hundred times quicker than smooth edges on a large frame.
+Coordinates are in pixels; the centre of the first pixel is at (0.5, 0.5). Drawings cover whole
+pixels, which is a hundred times faster than smooth edges on a large frame.
 """
 
 from typing import Any

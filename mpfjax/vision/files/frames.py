@@ -42,17 +42,18 @@ def read_frames(
     """Read frames `first` to `last`, both included and counted from 1: arrays (h, w, 3), in RGB.
 
     `path` is a video file, a folder of images in the natural order of their names (2.png before
-    10.png), or a folder with such a folder `img` or `img1`. All frames of a video are read,
-    whatever the time between them; both are rotated as the file says. None stands for a frame that
-    is too damaged to be decoded, so that those after it keep their numbers; a `RuntimeWarning` at
-    the end has the number and the count of these.
+    10.png), or a folder with such a folder `img` or `img1`. All frames of a video are read, for any
+    time between them; both are rotated as specified in the file. None stands for a frame that is
+    too damaged to be decoded, so that later frames keep their numbers; a `RuntimeWarning` at the
+    end reports the numbers and the count of these.
 
-    `times`: a list that takes the time of each frame of a video in seconds, before the frame comes;
-    always rising, by the mean rate where the file says nothing else. It stays empty for images.
+    `times`: a list to which the time of each frame of a video in seconds is appended, before the
+    frame is yielded; always increasing, by the mean rate if the file does not specify it. It stays
+    empty for images.
 
-    Raises `ImportError` without PyAV for a video,
-    `FileNotFoundError` where there is nothing, and `ValueError` with `path` if it cannot be read,
-    has no frames, or has frames of different sizes, and for `first` and `last` that are no range.
+    Raises `ImportError` without PyAV for a video, `FileNotFoundError` if nothing exists, and
+    `ValueError` with `path` if it cannot be read, has no frames, or has frames of different sizes,
+    and for `first` and `last` that are not a range.
     """
     if last is not None and last < first:
         raise ValueError(f"first, last: {first}, {last} is not a range of frames from 1 on")
@@ -106,10 +107,10 @@ def write_video(
 ) -> None:
     """Write RGB frames to an MP4 or, by the ending of `path`, a GIF that loops.
 
-    None, a frame that could not be decoded, is written as the frame before it. The file is complete
-    also where the frames end by an exception, and there is none before the first frame. Raises
-    `ValueError` for another ending, frames that are no images of one size and a rate that is not
-    positive, `ImportError` where PyAV is missing for an MP4.
+    None, a frame that could not be decoded, is written as the frame before it. The file is also
+    complete if the frames end by an exception, and there is none before the first frame. Raises
+    `ValueError` for another ending, frames that are not images of one size and a rate that is not
+    positive, `ImportError` if PyAV is missing for an MP4.
     """
     stills = without_gaps(of_one_kind(frames))
     if Path(path).suffix.lower() == ".gif":

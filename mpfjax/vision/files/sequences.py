@@ -1,4 +1,4 @@
-"""What the folder of a sequence holds: its metadata, files of detections, and ground truth."""
+"""The folder of a sequence: its metadata, files of detections, and ground truth."""
 
 import configparser
 import re
@@ -39,8 +39,7 @@ class Truth(NamedTuple):
     - `objects`: (s, 6), rows (frame, id, x, y, w, h) of the objects to be tracked.
     - `ignored`: (r, 6), rows (frame, kind, x, y, w, h) of what is not scored, with the kinds of
       `mpfjax.metrics.tracking_scores.remove_ignored`.
-    - `min_height`: a tracked box of at most this height that matches nothing is not scored; 0 for
-      none.
+    - `min_height`: an unmatched tracked box of at most this height is not scored; 0 for none.
     """
 
     objects: Float[np.ndarray, "s 6"]
@@ -61,29 +60,28 @@ def read_truth(path: str | Path, *, format: Format | None = None) -> Truth:
     """Read the ground truth of a sequence, and what its benchmark removes before scoring.
 
     `path` is a file, or a folder with `gt.txt` or `gt/gt.txt`. Rows are frame,id,x,y,w,h,flag and
-    up to three more columns, frames count from 1, and rows whose flag is 0 do not count. What the
-    further columns mean is told by `format`, or else by the files:
+    up to three more columns, frames count from 1, and rows whose flag is 0 do not count. The
+    meaning of the further columns is determined by `format`, or else by the files:
 
     - "motchallenge": the eighth column is a class. Only pedestrians (class 1) count; people on
       vehicles, static persons, distractors and reflections are ignored objects, in MOT20 other
-      vehicles as well; the rest is unscored. It is taken where `labels.txt` holds the benchmark's
-      own classes, where the sequence is called MOT16, MOT17 or MOT20, or where there are nine
-      columns, the last of which is a visibility, and the classes are its own, pedestrians among
-      them.
+      vehicles as well; the rest is unscored. It is assumed if `labels.txt` contains the benchmark's
+      own classes, if the sequence is called MOT16, MOT17 or MOT20, or if there are nine columns,
+      the last of which is a visibility, and the classes are its own, pedestrians among them.
     - "visdrone": ten columns, the eighth a category. Categories 1 to 10 count; 0 and 11, and rows
-      whose seventh column is 0, are ignored regions. It is taken where ten columns are its own.
-    - "uavdt": all rows count, and those of the `..._gt_ignore.txt` beside it are ignored regions.
-      It is taken for files that are called `..._gt_whole.txt`, or M0000_gt.txt with any number.
-    - "cvat": classes are those of `labels.txt` beside it, and all of them count. It is taken where
-      there is such a file, and where nothing else tells.
+      whose seventh column is 0, are ignored regions. It is assumed if the ten columns are its own.
+    - "uavdt": all rows count, and those of the `..._gt_ignore.txt` next to it are ignored regions.
+      It is assumed for files that are called `..._gt_whole.txt`, or M0000_gt.txt with any number.
+    - "cvat": classes are those of `labels.txt` next to it, and all of them count. It is assumed if
+      there is such a file, and no other format is recognised.
 
-    An `ignore.txt` beside it adds rows frame,kind,x,y,w,h of kind 1, an ignored object, or 2, an
+    An `ignore.txt` next to it adds rows frame,kind,x,y,w,h of kind 1, an ignored object, or 2, an
     ignored region. The start of the sequence's name in `seqinfo.ini`, or else of the folder's,
-    tells the benchmark: "MOT20..." ignores one more class, "kitti..." has a `min_height` of 25
+    determines the benchmark: "MOT20..." ignores one more class, "kitti..." has a `min_height` of 25
     pixels.
 
     Raises `ValueError` for a line that cannot be read, naming the file and the line, and for a file
-    without any row; `FileNotFoundError` where there is none. Use it with `multi_object_scores`. For
+    without any row; `FileNotFoundError` if there is none. Use it with `multi_object_scores`. For
     the rows of a tracker use `read_tracks`.
     """
     path = _truth_file(Path(path))

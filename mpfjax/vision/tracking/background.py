@@ -1,4 +1,4 @@
-"""Moving objects found by background subtraction, so that a tracker needs no drawn box."""
+"""Detection of moving objects by background subtraction, so that no box has to be drawn."""
 
 from collections import deque
 
@@ -28,27 +28,27 @@ _UNKNOWN_HEIGHT = 0.125
 
 
 class BackgroundSubtraction:
-    """Boxes of what moves while the camera stands still: an adaptive Gaussian mixture a pixel.
+    """Boxes of moving objects for a static camera: an adaptive Gaussian mixture per pixel.
 
     Lin et al. (2012), section 5, detect their targets in this way; the mixture is OpenCV's MOG2
-    (Zivkovic 2004). Pixels that fit none of the background's Gaussians and are no shadow form
+    (Zivkovic 2004). Pixels that fit none of the background's Gaussians and are not shadow form
     blobs. Gaps in the height of a blob are closed. A blob too wide for one object is cut where its
     outline dips, as between two heads. Blobs outside the limits of size and shape are dropped. The
-    usual shape is learned from the video unless it is given, under the assumption that most blobs
-    are single objects. Two objects one behind the other remain one blob, and an object that stands
-    still long enough becomes background.
+    usual shape is estimated from the video unless it is specified, under the assumption that most
+    blobs are single objects. Two objects one behind the other remain one blob, and an object that
+    stands still long enough becomes background.
 
     - `history`: frames over which the background is forgotten. An object that stands still becomes
       background after about half as many, or earlier in a young video; ghosts, left where an object
       stood from the first frame on, vanish by the same rule.
     - `threshold`: how many standard deviations from a Gaussian a pixel still belongs to it.
-    - `area`: least and largest area of a box, as shares of the frame's.
+    - `area`: minimum and maximum area of a box, as fractions of the frame's.
 
-    Defaults are tuned on people before a street camera. An instance serves one video, since it
-    keeps that video's background. Colour channels may come in any fixed order. Use it to start
-    tracks. It is of no use with a moving camera, where every pixel is foreground.
+    Defaults are tuned on people in front of a street camera. An instance serves one video, because
+    it stores that video's background. Colour channels may come in any fixed order. Use it to start
+    tracks. It is useless with a moving camera, for which every pixel is foreground.
 
-    Raises `ValueError` for a setting outside its range, `ImportError` where OpenCV is missing.
+    Raises `ValueError` for a setting outside its range, `ImportError` if OpenCV is missing.
     """
 
     @checked
@@ -73,10 +73,10 @@ class BackgroundSubtraction:
     def detect(self, frame: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "k 4"]:
         """The boxes (x, y, w, h) in pixels of moving objects, with (x, y) the top-left corner.
 
-        Boxes lie inside the frame, ordered from left to right. The first frame has none. A frame
-        joins the background; the fewer came before, the larger is its weight. Raises `ValueError`
+        Boxes are inside the frame, ordered from left to right. The first frame has none. A frame
+        updates the background; the fewer came before, the larger is its weight. Raises `ValueError`
         for a frame that is not (h, w, 3) of type uint8, or whose size differs from that of the
-        frames before it.
+        previous frames.
         """
         # OpenCV's own schedule: a young background learns fast, so that an object that was
         # there in the first frame leaves no ghost.

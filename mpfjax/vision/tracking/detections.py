@@ -1,4 +1,4 @@
-"""The detections of a frame: boxes or points, and how sure the detector was of each."""
+"""The detections of a frame: boxes or points, and the detector's score of each."""
 
 from typing import Any, NamedTuple
 
@@ -24,13 +24,13 @@ _UNBOUNDED = (-np.inf, -np.inf, np.inf, np.inf)
 
 
 class Detections(NamedTuple):
-    """What a detector found in one frame, a row for each; what it does not say is None.
+    """The output of a detector for one frame, a row for each detection; missing fields are None.
 
     - `boxes`: (k, 4), (x, y, w, h) with (x, y) the top-left corner, in pixels; or points, (k, 2).
-    - `scores`: (k,), how sure the detector was, on any scale, higher for surer.
-    - `classes`: (k,), whole numbers from 1 on, and 0 for none.
-    - `vectors`: (k, e), of whatever tells objects apart, such as embeddings for re-identification,
-      on any scale; zeros where there is none.
+    - `scores`: (k,), the detector's confidence, on any scale, higher for more certain.
+    - `classes`: (k,), integers from 1 on, and 0 for none.
+    - `vectors`: (k, e), any vectors that distinguish objects, such as embeddings for
+      re-identification, on any scale; zeros if there is none.
     """
 
     boxes: Float[np.ndarray, "k n"]
@@ -40,11 +40,11 @@ class Detections(NamedTuple):
 
     @classmethod
     def of(cls, output: Any, named: str, coordinates: int = 4) -> "Detections":
-        """What users hand over: boxes, or points, or a tuple as (boxes, scores, classes).
+        """The detections from a user's boxes, or points, or a tuple (boxes, scores, classes).
 
         Raises `ValueError` for boxes that are not rows of four numbers, or points of two, for
-        scores and classes that are not one number a box, for classes that are not whole numbers
-        from 0 on, and for vectors that are not one finite row a box.
+        scores and classes that are not one number per box, for classes that are not integers from 0
+        on, and for vectors that are not one finite row per box.
         """
         several = isinstance(output, tuple) and len(output) in (2, 3)
         parts: tuple[Any, ...] = output if several or isinstance(output, cls) else (output,)

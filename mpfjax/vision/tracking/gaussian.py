@@ -122,12 +122,12 @@ class Gaussian(NamedTuple):
 
 
 class CameraMotion(NamedTuple):
-    """Where the picture of what stands still has gone since the frame before: a similarity.
+    """The motion of the static background in the image since the previous frame: a similarity.
 
     A point (x, y) is now at (a x - b y, b x + a y) + shift, in pixels.
 
     - `turn`: (a, b), the cosine and sine of the angle, times the scale; `shift`: in pixels.
-    - `known`: whether it was found; if not, the others mean nothing.
+    - `known`: whether it was estimated; if not, the others mean nothing.
     """
 
     turn: Float[np.ndarray, "2"]
@@ -136,22 +136,22 @@ class CameraMotion(NamedTuple):
 
     @classmethod
     def unknown(cls) -> "CameraMotion":
-        """No motion was found."""
+        """An unknown motion."""
         return cls(np.array([1.0, 0.0]), np.zeros(2), False)
 
     moved = Renamed("moved", "move")
     carried = Renamed("carried", "carry")
 
     def move(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Where points are that stand still; as they are where the motion is unknown."""
+        """The new positions of static points; unchanged if the motion is unknown."""
         (a, b), shift = self.turn, self.shift
         return points @ np.array([[a, b], [-b, a]]) + shift if self.known else points
 
     def carry(self, moments: Gaussian) -> Gaussian:
-        """The moments of what moves with the picture; as they are where the motion is unknown.
+        """The moments of what moves with the image; unchanged if the motion is unknown.
 
-        Means of places and velocities turn, sizes grow by the scale. Covariances along x and y are
-        those of the turned ones without what couples the two.
+        Means of positions and velocities are rotated, sizes grow by the scale. Covariances along x
+        and y are those of the rotated ones without the coupling of the two.
         """
         if not self.known:
             return moments

@@ -1,4 +1,4 @@
-"""The camera's motion from pixels: corners of what stands still, followed by OpenCV."""
+"""The camera's motion from pixels: corners of the static background, followed by OpenCV."""
 
 import importlib.util
 from typing import Any
@@ -25,17 +25,17 @@ _SMALLEST = 32  # the least side of a reduced picture
 
 
 class OpticalFlow:
-    """The motion of the camera between successive frames, from the pixels outside of boxes.
+    """The motion of the camera between successive frames, from the pixels outside boxes.
 
-    Each frame is reduced to a grey picture about 320 pixels wide. Corners (Shi and Tomasi 1994) of
-    the frame before, outside of its boxes, are followed by the pyramidal method of Lucas and Kanade
-    (Bouguet 2001). The similarity that most of them agree with, within a pixel of the reduced
-    picture, is found by RANSAC and refined by least squares over these.
+    Each frame is reduced to a grey image about 320 pixels wide. Corners (Shi and Tomasi 1994) of
+    the previous frame, outside its boxes, are followed by the pyramidal method of Lucas and Kanade
+    (Bouguet 2001). The similarity with which most of them agree, within a pixel of the reduced
+    image, is estimated by RANSAC and refined by least squares over these.
 
-    The motion is unknown in the first frame, where fewer than 12 corners agree, and where they are
-    no majority of those that were followed: after a cut, or without texture. An instance serves one
-    video. The same frames give the same motions. Raises `ImportError` without OpenCV. Use it for
-    the `motion` that `ObjectTracker.step` takes; `track` does so by itself.
+    The motion is unknown in the first frame, if fewer than 12 corners agree, and if they are not a
+    majority of those that were followed: after a cut, or without texture. An instance serves one
+    video. The same frames yield the same motions. Raises `ImportError` without OpenCV. Use it for
+    the argument `motion` of `ObjectTracker.step`; `track` does so automatically.
     """
 
     def __init__(self) -> None:

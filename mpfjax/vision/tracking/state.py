@@ -1,4 +1,4 @@
-"""What a tracker knows after a frame, and what it says of it."""
+"""The state of a tracker after a frame, and its report."""
 
 from typing import NamedTuple
 
@@ -18,23 +18,23 @@ from mpfjax.vision.tracking.vectors import Likeness
 
 
 class TrackerState(NamedTuple):
-    """All that an `ObjectTracker` remembers, with a row for each object.
+    """The memory of an `ObjectTracker`, with a row for each object.
 
-    - `objects`: the moments of place and velocity, (m, 4) each, or (m, 2) of points.
+    - `objects`: the moments of position and velocity, (m, 4) each, or (m, 2) for points.
     - `lives`: identities and counts.
-    - `scores`, `noise`, `camera`: what has been learned of the detector, the motion and the camera.
-    - `colours`: (m, bins), the histograms of each object, all zero where it has none.
-    - `coasting`, `duplicates`: how long predictions are right; which are a second box of another
-      one.
-    - `vectors`: (m, e), as the detector's; `likeness`: what has been learned of these.
-    - `clutter`: of points, how densely those of nobody lie.
-    - `last_identity`: the highest ever given.
+    - `scores`, `noise`, `camera`: estimates on the detector, the motion and the camera.
+    - `colours`: (m, bins), the histograms of each object, all zero if it has none.
+    - `coasting`, `duplicates`: how long predictions are correct; which are a second box of another
+      object.
+    - `vectors`: (m, e), as the detector's; `likeness`: estimates of their similarity.
+    - `clutter`: for points, the clutter density.
+    - `last_identity`: the highest identity so far.
     - `full`: whether there was no room for a new object in the last frame.
     - `has_begun`: whether there was a frame on which the detector ran; `waited`: for how many
       frames it has not run since.
-    - `time`: in seconds, of the last frame; None where nobody said it.
-    - `forms`: (3,), of the first boxes, as `FrameDetections.form_counts` has them.
-    - `number`: how many frames there were; `left_out`: (3,), how many detections could not be
+    - `time`: in seconds, of the last frame; None if unknown.
+    - `forms`: (3,), of the first boxes, as in `FrameDetections.form_counts`.
+    - `number`: the number of frames so far; `left_out`: (3,), how many detections could not be
       tracked, by `FAULTS`.
     """
 
@@ -64,17 +64,17 @@ class Tracks(NamedTuple):
     """The tracks in one frame, a row for each object.
 
     - `boxes`: (m, 4), the mean box of each, centre and size in pixels; (m, 2), its mean point.
-    - `identities`: (m,), a number that an object keeps for life.
-    - `confirmed`: (m,), whether it has had enough detections to be taken for an object.
+    - `identities`: (m,), a number that an object keeps for its lifetime.
+    - `confirmed`: (m,), whether it has had enough detections to be confirmed as an object.
     - `unseen`: (m,), frames since its last detection.
-    - `full`: whether a detection that would have started an object found no room.
-    - `shown`: (m,), which are confirmed, were detected a moment ago, and are not more probably
-      duplicates of another one.
-    - `detections`: (m,), the row of the detection assigned to each in this frame, in what the
-      detector gave; -1 for none. Use it to look up masks and features.
-    - `probabilities`: (m,), that this detection is the object's own; 0 where there is none.
+    - `full`: whether there was no room for a detection that would have started an object.
+    - `shown`: (m,), which are confirmed, were detected recently, and are probably not duplicates of
+      another one.
+    - `detections`: (m,), the row of the detection assigned to each in this frame, in the detector's
+      output; -1 for none. Use it to look up masks and features.
+    - `probabilities`: (m,), that this detection is the object's own; 0 if there is none.
     - `classes`: (m,), the class of each, the first that its detections had; 0 for none.
-    - `scores`: (m,), the score of the latest detection of each, 1 where detections have none.
+    - `scores`: (m,), the score of the latest detection of each, 1 if detections have none.
     - `left_out`: how many detections of this frame could not be tracked.
     - `number`: of the frame, as files and `track` count them; frames of `step` count from 1.
     """
@@ -94,5 +94,5 @@ class Tracks(NamedTuple):
 
     @property
     def corner_boxes(self) -> Float[np.ndarray, "m k"]:
-        """The boxes (x, y, w, h) with (x, y) the top-left corner, as files have them; or points."""
+        """The boxes (x, y, w, h) with (x, y) the top-left corner, as in files; or points."""
         return top_left(np.asarray(self.boxes))

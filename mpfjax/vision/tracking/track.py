@@ -46,53 +46,53 @@ def track(
     camera_motion: Annotated[str, one_of(("pixels", "detections"))] | None = None,
     ahead: bool = False,
 ) -> Generator[Tracks, None, None]:
-    """Track what a detector finds in a video: yields the `Tracks` of each frame as it comes.
+    """Track the detections of a video: yields the `Tracks` of each frame as it is processed.
 
-    The tracks of a frame depend on this frame and earlier ones only. Any detector will do:
+    The tracks of a frame depend on this frame and earlier ones only. Any detector can be used:
 
         track(frames, lambda frame: network(frame))        # boxes, scores and classes
         track(frames, read_detections("det.txt"))          # rows of a MOTChallenge file
-        track(frames, BackgroundSubtraction().detect)      # the camera stands still
+        track(frames, BackgroundSubtraction().detect)      # a static camera
         track(None, rows)                                  # without pixels, for speed
 
     - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable, or the
-      path of a video or of a folder of images, from frame `first` on; None where there are only
-      detections. A frame that is None, as `read_frames` has it for a damaged one, is predicted.
+      path of a video or of a folder of images, from frame `first` on; None if there are only
+      detections. A frame that is None, as returned by `read_frames` for a damaged one, is
+      predicted.
     - `detections`: a function from a frame to its boxes (x, y, w, h), top-left corner first, in
-      pixels, or to a tuple of boxes and scores (None for none), or of boxes, scores and classes;
-      or an iterable of these, one item for each frame, or a mapping from the numbers of frames to
-      them; or an array of rows (frame, id, x, y, w, h, score) whose frames count from 1, or the
-      path of a MOTChallenge file of these. None in the place of boxes, and a frame that a mapping
-      has not, says that the detector did not run, which is not "nothing there". For a tracker of
-      points they are (x, y), and rows (frame, id, x, y, score). `Detections` may hold vectors, such
-      as embeddings, by which look-alikes in motion are told apart.
-    - `tracker`: None takes `ObjectTracker()`, with more room where a frame has more rows.
-    - `key`: counts for nothing, since nothing is drawn.
-    - `first`: the number of the first frame, by which rows are found. None is 1, and without
-      `frames` that of the first row.
-    - `times`: of the frames in seconds, rising, where these are not equally far apart; a video that
-      is given by its path has its own. None takes `frames_per_second` of the tracker.
-    - `min_score`: detections with a lower score are left out; None leaves out none.
-    - `max_detections`: the most detections in a frame; if there are more, the strongest are kept.
-      None takes twice the tracker's `max_objects`.
-    - `use_colours`: with False the tracker sees no pixels, and only the detector does.
-    - `frame_size`: height and width, for detections without frames, to tell which boxes and
-      objects lie outside; None where there is no border.
-    - `camera_motion`: "pixels" finds the motion of the camera by `OpticalFlow`, and what this
-      leaves from the detections; "detections" has them alone. None takes "pixels" where the tracker
-      sees pixels and OpenCV is installed.
-    - `ahead`: read, detect and look at pixels in a thread of its own, up to four frames ahead of
-      the tracks; `close()`, or the last track, ends the thread. Use it for recordings, which then
-      take less time; a camera's tracks would be late.
+      pixels, or to a tuple of boxes and scores (None for none), or of boxes, scores and classes; or
+      an iterable of these, one item for each frame, or a mapping from frame numbers to them; or an
+      array of rows (frame, id, x, y, w, h, score) whose frames count from 1, or the path of a
+      MOTChallenge file of these. None instead of boxes, and a frame that a mapping does not
+      contain, mean that the detector did not run, which is not "no objects". For a tracker of
+      points they are (x, y), and rows (frame, id, x, y, score). `Detections` may contain vectors,
+      such as embeddings, which distinguish similar objects in motion.
+    - `tracker`: None is `ObjectTracker()`, with more room if a frame has more rows.
+    - `key`: ignored, because nothing is random.
+    - `first`: the number of the first frame, by which rows are selected. None is 1, and without
+      `frames` the number of the first row.
+    - `times`: of the frames in seconds, increasing, if these are not equally spaced; a video that
+      is specified by its path has its own. None uses `frames_per_second` of the tracker.
+    - `min_score`: detections with a lower score are ignored; None ignores none.
+    - `max_detections`: the maximum number of detections in a frame, of which the strongest are
+      used. None is twice the tracker's `max_objects`.
+    - `use_colours`: with False the tracker does not use pixels, and only the detector does.
+    - `frame_size`: height and width, for detections without frames, to determine which boxes and
+      objects are outside; None if there is no border.
+    - `camera_motion`: "pixels" estimates the motion of the camera by `OpticalFlow`, and the
+      remainder from the detections; "detections" uses only them. None is "pixels" if the tracker
+      uses pixels and OpenCV is installed.
+    - `ahead`: read, detect and process pixels in a separate thread, up to four frames ahead of the
+      tracks; `close()`, or the last track, ends the thread. Use it for recordings, which then take
+      less time; with a camera, tracks would be late.
 
-    Coordinates may be large, as those of maps are. Boxes that are not finite, have no area or lie
-    outside the frame are left out; the first of each kind is warned of, and `Tracks.left_out`
-    counts them. There are warnings for detections in frames after the last, and for more detections
-    or objects than there is room for.
-    Raises `ValueError` with the name of the argument for values that cannot be used, at the frame
-    in which they come, for a row more than a minute after the one before it where there are no
-    `frames`, and `ImportError` for "pixels" without OpenCV. An exception of the detector is passed
-    on, with the number of the frame. Use it for recorded videos and for cameras.
+    Coordinates may be large, as on maps. Boxes that are not finite, have no area or are outside the
+    frame are ignored; the first of each kind causes a warning, and `Tracks.left_out` counts them.
+    There are warnings for detections in frames after the last, and for more detections or objects
+    than there is room for. Raises `ValueError` with the name of the argument for values that cannot
+    be used, at the frame in which they occur, for a row more than a minute after the previous one
+    if there are no `frames`, and `ImportError` for "pixels" without OpenCV. An exception of the
+    detector is passed on, with the number of the frame. Use it for recorded videos and for cameras.
     """
     del key
     coordinates = (BOXES if tracker is None else tracker.kind).coordinates
@@ -185,8 +185,8 @@ def _track(
 def online_rows(tracks: Tracks, *, described: bool = False) -> Float[np.ndarray, "k columns"]:
     """Rows (frame, id, x, y, w, h) of the objects that are shown in a frame (`Tracks.shown`).
 
-    The frame is `Tracks.number`. Those of points are (frame, id, x, y).
-    With `described` each has two more columns, the score of its latest detection and its class.
+    The frame is `Tracks.number`. For points the rows are (frame, id, x, y). With `described` each
+    has two more columns, the score of its latest detection and its class.
     """
     return _rows(tracks, tracks.shown, described)
 

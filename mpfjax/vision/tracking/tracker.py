@@ -24,41 +24,41 @@ _COLOURS, _BANDS = HSVColours(num_hues=8, num_saturations=4, num_values=6), 3
 class ObjectTracker(Checked):
     """Tracks an unknown and changing number of objects, with any detector.
 
-    Every object has a Kalman filter for its box. `step` is a function of the state and of what is
-    found in a frame; nothing is drawn at random. In a step
+    Every object has a Kalman filter for its box. `step` is a deterministic function of the state
+    and of the detections of a frame. In a step
 
-    - objects move by their velocities, and by the motion that all have in common, the camera's;
-    - the detections' scores tell which are strong, by what became of earlier ones;
+    - objects move by their velocities, and by their common motion, the camera's;
+    - the scores of detections determine which are strong, by what became of earlier ones;
     - each pair of object and detection has a probability in the joint distribution of all
-      one-to-one assignments; the most probable assignment is chosen, and an object follows its
-      detection by the probability of the pair, as in probabilistic data association;
-    - objects without detections, or outside the frame, end; strong detections that nobody explains
-      begin new ones;
-    - the detector's errors and the noises of the motion are learned from the innovations.
+      one-to-one assignments; the most probable assignment is chosen, and an object is updated by
+      its detection according to the probability of the pair, as in probabilistic data association;
+    - objects without detections, or outside the frame, end; strong detections that no object
+      explains start new ones;
+    - the detector's errors and the noises of the motion are estimated from the innovations.
 
     Lengths are in boxes, so that nothing depends on the size of the frame or of the objects; with
-    `point_deviation` in deviations of points. Who has which point is told by distance alone, and
-    by how densely points of nobody lie, which is learned. One new point in ten is of an object, and
-    one of an object's seven is missed: assumptions, and no measurements; odds of 20 to 1 confirm an
-    object. Two that begin nearer than 3.5 deviations are one until they part. Vectors beside boxes
-    count by what their cosine distances have told.
+    `point_deviation` they are in standard deviations of points. Points are assigned by distance
+    alone, and by the clutter density, which is estimated. One new point in ten is assumed to be of
+    an object, and one of an object's seven to be missed; odds of 20 to 1 confirm an object. Two
+    objects that start within 3.5 standard deviations of each other are one until they separate.
+    Vectors of boxes are weighted by the information in their cosine distances so far.
 
-    - `max_objects`: M, how many objects there is room for.
+    - `max_objects`: M, the maximum number of objects.
     - `frames_per_second`: of the video.
-    - `lost_seconds`: an object ends after so long without a detection. None takes a second, and
-      eight frames where these are longer.
-    - `point_deviation`: detections are points (x, y) with an error of this deviation along each,
-      and no boxes: plots of a radar, keypoints, animals seen from above.
-    - `scores`: "rank" finds from which score on a detection is strong, and starts an object, on any
-      scale. "as_given" takes scores for probabilities: strong from .5 on, and below .2 a detection
-      counts for nothing. "ignore" takes all for strong.
-    - `class_matters`: with True objects have detections of their own class only, and those of
-      another one are no duplicates. "prefers" is for detectors that mix up classes: another class
-      costs as much as a weak score does. False does not look at classes. Class 0 is none, and goes
-      with all.
+    - `lost_seconds`: an object ends after so long without a detection. None is one second, or eight
+      frames if these are longer.
+    - `point_deviation`: detections are points (x, y) with an error of this standard deviation along
+      each coordinate, instead of boxes: radar detections, keypoints, animals in aerial images.
+    - `scores`: "rank" estimates the score from which a detection is strong, and starts an object,
+      on any scale. "as_given" interprets scores as probabilities: strong from .5 on, and a
+      detection below .2 is ignored. "ignore" treats all as strong.
+    - `class_matters`: with True objects are matched with detections of their own class only, and
+      those of another class are not duplicates. "prefers" is for detectors that confuse classes:
+      another class is penalised as much as a weak score. False ignores classes. Class 0 is none,
+      and matches all.
 
-    Raises `ValueError` for a number of objects that is not whole, or below 1, a rate that is not
-    positive, and scores or classes that are none of these.
+    Raises `ValueError` for a number of objects that is not an integer, or below 1, a rate that is
+    not positive, and scores or classes that are none of these.
     """
 
     max_objects: Count = eqx.field(static=True, default=24)
@@ -72,12 +72,12 @@ class ObjectTracker(Checked):
 
     @property
     def rate(self) -> float:
-        """Frames a second, 25 where nobody says."""
+        """Frames per second, 25 if not specified."""
         return 25.0 if self.frames_per_second is None else float(self.frames_per_second)
 
     @property
     def kind(self) -> Kind:
-        """What detections are: boxes or points."""
+        """The kind of the detections: boxes or points."""
         return Kind.of(self.point_deviation)
 
     def init(self) -> TrackerState:
@@ -105,19 +105,20 @@ class ObjectTracker(Checked):
     ) -> tuple[TrackerState, Tracks]:
         """The state after a frame and its detections, and the tracks in it.
 
-        `detections` are what a detector of `track` gives: boxes, (boxes, scores), (boxes, scores,
-        classes), or `Detections`; with `point_deviation` points in the place of boxes; None where
-        it did not run, which is not "nothing there". Those that cannot be tracked are left out as
-        by `track`, and counted in the state. Where `frame` is None they are tracked alone, without
-        colours. Nothing is drawn: the key may be None.
+        `detections` are the same as from a detector of `track`: boxes, (boxes, scores), (boxes,
+        scores, classes), or `Detections`; with `point_deviation` points instead of boxes; None if
+        it did not run, which is not "no objects". Detections that cannot be tracked are ignored as
+        by `track`, and counted in the state. If `frame` is None, colours are not used. Nothing is
+        random: the key may be None.
 
-        - `motion`: what `OpticalFlow` makes of the frames; None leaves it to the detections.
-        - `time`: in seconds, for frames that are not equally far apart; None takes the frame after
-          the last, by `frames_per_second`.
-        - `frame_size`: height and width, where there is no frame and they are known.
+        - `motion`: the result of `OpticalFlow` for the frames; None estimates it from the
+          detections.
+        - `time`: in seconds, for frames that are not equally spaced; None is the next frame by
+          `frames_per_second`.
+        - `frame_size`: height and width, if there is no frame and they are known.
 
         Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, for a time that is not
-        after the one before, and for detections as `Detections.of` does.
+        after the previous one, and for detections as `Detections.of` does.
         """
         del key
         trackable = None
