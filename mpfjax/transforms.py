@@ -140,9 +140,8 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
         return dataclasses.replace(move, proposal=look) if move.proposal is None else move
 
     ahead = _change_in_chain(plain, Resample, lambda move: AuxiliaryResample(move, look))
-    return (
-        _change_in_chain(ahead, Propagate, guided) if isinstance(look, AbstractProposal) else ahead
-    )
+    is_proposal = isinstance(look, AbstractProposal)
+    return _change_in_chain(ahead, Propagate, guided) if is_proposal else ahead
 
 
 def _lookahead_of(filter: Filter) -> Lookahead:
@@ -163,9 +162,7 @@ def with_initial_selection(filter: Filter, num_draws: Count = 4) -> Filter:
     """
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
     if num_draws > 1 and any(move.at_start for move in _restarts(filter)):
-        raise ValueError(
-            "filter: its x_0 is chosen by more observations than y_1, by with_initialisation"
-        )
+        raise ValueError("filter: with_initialisation selects x_0 by more observations than y_1")
     if num_draws == 1:
         return filter.replace(initial_moves=others)
     select = SelectInitial(num_draws, filter.initial_noise)

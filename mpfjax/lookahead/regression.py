@@ -141,10 +141,8 @@ def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
         return _integrate_noise(*quadratic, points.noise.shape[1]), square_error
 
     whitened = jnp.swapaxes(located.whitened(points.features), 1, 2)
-    experts, square_error = jax.lax.map(fit, (weights.T, whitened))
-    square_error = jnp.sum(jnp.where(alive, square_error, 0.0)) / _count(
-        alive, points.targets.dtype
-    )
+    experts, errors = jax.lax.map(fit, (weights.T, whitened))
+    square_error = jnp.sum(jnp.where(alive, errors, 0.0)) / _count(alive, points.targets.dtype)
     return replace(
         located,
         **experts,

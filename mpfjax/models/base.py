@@ -137,10 +137,8 @@ def require(model: Any, method: str, needed_by: str, argument: str = "model") ->
         raise ValueError(f"{argument}: a {type(model).__name__} is no model, and holds one, .model")
     if not callable(getattr(model, method, None)):
         who = shown(model) if model is None else model_name(model)
-        library_names = {*_BATCHED, *_SHARED, *vars(AbstractStateSpaceModel)}
-        close = difflib.get_close_matches(
-            method, vars(type(_unwrap(model))).keys() - library_names, 1
-        )
+        methods = {*_BATCHED, *_SHARED, *vars(AbstractStateSpaceModel)}
+        close = difflib.get_close_matches(method, vars(type(_unwrap(model))).keys() - methods, 1)
         hint = f"; is {close[0]} meant for it?" if close else ""
         raise ValueError(f"{argument}: {who} defines no {method}, which {needed_by} needs{hint}")
 

@@ -132,9 +132,7 @@ def _smooth(key, smoother, series, lag):
     rest = jax.vmap(lambda r: terms.row(r).estimates_in(final))(
         np.arange(length - lag, length) % num_rows
     )
-    estimates = jax.tree.map(
-        lambda done, rest: jnp.concatenate([done[lag:], rest]), final_terms, rest
-    )
+    estimates = jax.tree.map(lambda a, b: jnp.concatenate([a[lag:], b]), final_terms, rest)
     sums = jax.tree.map(lambda means: jnp.cumsum(means, axis=0), estimates.means)
     return SmoothedSums(sums, estimates.means, run, estimates.variances)
 

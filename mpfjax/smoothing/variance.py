@@ -53,9 +53,8 @@ class _KeepEveIndices(AbstractMove):
                 chosen, name = getattr(part, option, independent), type(part).__name__
                 if chosen != independent:
                     name = "the filter" if part is now else name
-                    raise ValueError(
-                        f"filter: {option} of {name} is {chosen!r}, not {independent!r}"
-                    )
+                    which = f"{chosen!r}, not {independent!r}"
+                    raise ValueError(f"filter: {option} of {name} is {which}")
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
@@ -229,9 +228,8 @@ def batch_estimate(
     estimates = jax.vmap(lambda shares: jnp.tensordot(shares, values, axes=1))(
         jax.nn.softmax(log_evidences, axis=1).astype(values.dtype)
     )
-    log_z = jax.vmap(log_sum_exp)(log_evidences) - jnp.log(
-        jnp.sum(stays, axis=1).astype(logs.dtype)
-    )
+    number_left = jnp.sum(stays, axis=1).astype(logs.dtype)
+    log_z = jax.vmap(log_sum_exp)(log_evidences) - jnp.log(number_left)
     shares = jax.nn.softmax(logs)
     return BatchEstimate(
         value=estimates[0],

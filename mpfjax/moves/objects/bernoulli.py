@@ -172,9 +172,7 @@ class Associate(AbstractWrapper):
         highest = jnp.maximum(jnp.max(log_odds, axis=0), jnp.max(log_born, axis=1))
         units = jax.lax.stop_gradient(jnp.maximum(highest, 0.0))
         likely = (before.masses * detection)[:, None] * exp(log_odds - units[None])
-        num_survivors = (
-            first // 2
-        )  # the others are new ones, which are proposed at the measurements
+        num_survivors = first // 2  # the others are new ones, proposed at the measurements
         starts = jnp.concatenate([likely[:num_survivors].T, exp(log_born - units[:, None])], axis=1)
 
         pairs, unseen = before.sums(likely), before.masses * (1 - detection)
@@ -215,11 +213,8 @@ class Associate(AbstractWrapper):
 
         Over that of clutter.
         """
-        size, sensor, is_there = (
-            self.particles_per_birth,
-            model.sensors[number],
-            measurement_mask(scan),
-        )
+        size, sensor = self.particles_per_birth, model.sensors[number]
+        is_there = measurement_mask(scan)
 
         def propose(key: Key[Array, ""], measurement: PyTree) -> tuple:
             states, log_masses = model.birth.propose(key, measurement, size, number)

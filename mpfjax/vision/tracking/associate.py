@@ -31,11 +31,8 @@ def unlikeness(
 
     B² is the squared Bhattacharyya distance of histograms, the mean over the bands of a box.
     """
-    alike = (
-        np.sqrt(references)
-        @ np.sqrt(descriptors).T
-        / np.maximum(np.sum(references, axis=1)[:, None], 1.0)
-    )
+    total = np.maximum(np.sum(references, axis=1)[:, None], 1.0)
+    alike = np.sqrt(references) @ np.sqrt(descriptors).T / total
     cost = _COLOUR_COST * (1 - alike - _UNDECIDED)
     return np.where(np.any(references, axis=1, keepdims=True), cost, 0.0)
 

@@ -123,14 +123,8 @@ class Lives(NamedTuple):
         odds = self.odds + gained
         confirmed = self.confirmed | ((num_strong >= _CONFIRMED) & (odds >= 0))
         recent = confirmed & (unseen <= coast) & (unsure <= spans.unsure)
-        lives = self._replace(
-            num_strong=num_strong,
-            unseen=unseen,
-            unsure=unsure,
-            confirmed=confirmed,
-            shown=recent,
-            odds=odds,
-        )
+        lives = self._replace(num_strong=num_strong, unseen=unseen, unsure=unsure, odds=odds)
+        lives = lives._replace(confirmed=confirmed, shown=recent)
         in_the_way = full & (num_strong < _CONFIRMED)
         tentative = 0 if full else _TENTATIVE * frames
         most = np.where(confirmed, np.where(in_the_way, spans.coast, spans.patience), tentative)

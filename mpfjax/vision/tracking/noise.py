@@ -125,8 +125,8 @@ class NoiseState(NamedTuple):
         prior, doubts, _ = _BEFORE[evidence.shape[1]]
         logs = np.log(_RIVALS[evidence.shape[1]][:, 0])
         away = (logs - np.log(prior)[:, None]) / doubts[:, None, None]
-        posterior_weights = softmax(evidence - 0.5 * np.sum(away**2, axis=0), axis=0)
-        means = self.scale[:, None] * np.exp(np.sum(posterior_weights[None] * logs, axis=1))
+        weights = softmax(evidence - 0.5 * np.sum(away**2, axis=0), axis=0)
+        means = self.scale[:, None] * np.exp(np.sum(weights[None] * logs, axis=1))
         rest = evidence, squares, newborn, self.start, self.scale
         return NoiseState(self.moments, *rest, Noises(*means, speed=speed))
 

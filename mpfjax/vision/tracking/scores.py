@@ -91,15 +91,13 @@ class ScoreState(NamedTuple):
         spread = sure - lowest
         shares = (scores - lowest) / spread if spread > 0 else np.ones_like(scores)
         single = ~np.triu(overlaps > _DUPLICATE, 1).any(axis=0)
-        state = self._continue_chains(
-            boxes[single], moved, shares[single], frames, lasting, variance
-        )
+        state = self._continue(boxes[single], moved, shares[single], frames, lasting, variance)
         strong = lowest + state.strong_share() * spread
         # Where all scores are equal, rounding must not put them below the threshold.
         weak = min(lowest + WEAK * spread, strong) if len(recent) else -np.inf
         return state._replace(recent=recent, weak=weak, strong=strong)
 
-    def _continue_chains(
+    def _continue(
         self,
         detections: Float[np.ndarray, "d k"],
         moved: Float[np.ndarray, "c k"],
@@ -119,14 +117,9 @@ class ScoreState(NamedTuple):
             nearness[pairs] = np.maximum(nearness[pairs], certainty + common)
         rows = argmax_pairs(nearness)
         is_detected = rows >= 0
-        continuing, new = (
-            np.flatnonzero(is_detected),
-            np.setdiff1d(np.arange(len(detections)), rows),
-        )
+        old, new = np.flatnonzero(is_detected), np.setdiff1d(np.arange(len(detections)), rows)
         steps = np.concatenate([self.steps, np.zeros((len(new), 2))])
-        steps[continuing] = (detections[rows[continuing]] - moved[continuing])[:, :2] / since[
-            continuing
-        ]
+        steps[old] = (detections[rows[old]] - moved[old])[:, :2] / since[old]
         # New chains come after the others.
         rows, is_detected = np.append(rows, new), np.append(is_detected, new >= 0)
         none = np.zeros(len(new), int)
