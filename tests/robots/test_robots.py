@@ -224,7 +224,7 @@ def test_usable_beams_are_spaced_evenly():
     scan[200:483] = 1.0 + 0.001 * np.arange(283)
     sensor = robots.LikelihoodField(angles, laser_max_range=MOST)
     usable = sensor.usable(jnp.asarray(scan), jnp.asarray(scan < MOST))
-    at, is_used = sensor._spaced(usable, jnp.arange(720))
+    at, is_used = sensor._space_out(usable, jnp.arange(720))
     assert is_used.all()
     assert at.tolist() == (200 + np.linspace(0, 282, 60).round()).astype(int).tolist()
     holed = np.where(np.arange(720) % 2, 1.5, np.nan).astype(np.float32)
