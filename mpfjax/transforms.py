@@ -184,10 +184,10 @@ def with_initialisation(filter: Filter, num_observations: Count = 8) -> Filter:
     distinguish the modes. It is also the number for restarts.
     """
     if any(move.at_start for move in _restarts(filter)):
-        raise ValueError("filter: it has a start by its first observations already")
+        raise ValueError("filter: it is initialised by its first observations already")
     initial = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
     if not all(map(_regroups, initial)):
-        what = "its initial moves do more than regroup, and a start replaces x_0"
+        what = "its initial moves do more than regroup, but x_0 is to be replaced"
         raise ValueError(f"filter: {what}")
     filter = filter.replace(initial_moves=initial)
     return _with_restart(filter, num_observations=num_observations, at_start=True)

@@ -134,7 +134,7 @@ def require(model: Any, method: str, needed_by: str, argument: str = "model") ->
     if isinstance(model, type):
         raise ValueError(f"{argument}: {shown(model)} is a class; write {model.__name__}(...)")
     if hasattr(model, "initial_moves"):
-        raise ValueError(f"{argument}: a {type(model).__name__} is no model, and holds one, .model")
+        raise ValueError(f"{argument}: a {type(model).__name__} is no model, but has one, .model")
     if not callable(getattr(model, method, None)):
         who = shown(model) if model is None else model_name(model)
         methods = {*_BATCHED, *_SHARED, *vars(AbstractStateSpaceModel)}

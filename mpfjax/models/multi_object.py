@@ -141,7 +141,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
     def _sample_observation(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """The observation of every object, leaves (n, J, ...)."""
         if self.shared_observation:
-            raise ValueError("shared_observation: how several objects make one is not known")
+            raise ValueError("shared_observation: it cannot be simulated for several objects")
         return self._of_each("sample_observation", (0, 1), split(key, self.num_objects), states)
 
     def _of_each(self, method: str, axes: tuple[int, ...], *arguments: PyTree) -> PyTree:

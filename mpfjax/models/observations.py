@@ -67,7 +67,7 @@ def series_of(data: PyTree, inputs: PyTree = None, missing: str = "error") -> Se
     if not isinstance(data, Series):
         return Series(data, inputs, skips_missing=missing == "skip")
     if inputs is not None or missing != "error":
-        raise ValueError("observations: a Series says itself its inputs and what is missing")
+        raise ValueError("observations: a Series itself contains inputs and marks what is missing")
     return data
 
 
@@ -184,7 +184,7 @@ def _warn_of_parts(observations: PyTree, skipped: Bool[np.ndarray, " t"]) -> Non
         if (skipped & some).any():
             number = f"{(skipped & some).sum()} of {len(skipped)} steps"
             message = f"{number} are skipped for a NaN or infinity beside finite numbers"
-            warn(f"observations: {message}; a model with handles_missing = True is given them")
+            warn(f"observations: {message}; a model with handles_missing = True receives them")
 
 
 # What of an observation or of inputs is refused; "" is nothing.

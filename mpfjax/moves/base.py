@@ -69,7 +69,7 @@ class Given(Checked):
         for name in self.__dataclass_fields__:
             if isinstance(getattr(self, name), AbstractStateSpaceModel):
                 who = type(self).__name__
-                raise ValueError(f"{name}: a model, and {who} holds none; the filter has its own")
+                raise ValueError(f"{name}: a model, but {who} stores none; the filter has its own")
         super().__check_init__()
 
 
@@ -199,7 +199,7 @@ def memory_of(moves: Iterable[AbstractMove], now: Step, num_components: int) -> 
     for move in moves:
         entries = move.initial_memory(now, num_components)
         for name in sorted(entries.keys() & memory.keys()):
-            raise ValueError(f"moves: two of them keep the memory {name!r}, as {name_of(move)}")
+            raise ValueError(f"moves: two of them use the memory {name!r}, as {name_of(move)}")
         memory |= entries
     return memory
 

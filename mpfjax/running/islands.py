@@ -85,7 +85,7 @@ def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any
     chosen = choose_devices(devices)
     most = max(d for d in range(1, len(chosen) + 1) if num_islands % d == 0)
     if most < len(chosen) and (devices is not None or jax.process_count() > 1):
-        raise ValueError(f"num_islands: {num_islands} cannot be dealt to {len(chosen)} devices")
+        raise ValueError(f"num_islands: {num_islands} cannot be split over {len(chosen)} devices")
     return chosen[:most]
 
 

@@ -74,7 +74,7 @@ class Replay(Checked):
         step without it). Raises `ValueError` for a step that is no longer stored.
         """
         if steps_ago >= len(history.steps):
-            raise ValueError(f"steps_ago: {steps_ago}, and {len(history.steps)} steps are kept")
+            raise ValueError(f"steps_ago: {steps_ago}, and {len(history.steps)} steps are stored")
         place = len(history.steps) - 1 - steps_ago
         steps, infos = list(history.steps), []
         steps[place] = steps[place]._replace(observation=observation)

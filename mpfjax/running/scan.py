@@ -197,8 +197,8 @@ def sound(run: FilterRun, free: bool = True) -> FilterRun:
     is_blind = degenerate.any(axis=-1) & (degenerate | (np.asarray(increments) == 0)).all(axis=-1)
     if is_blind.any():
         which = _in_how_many(is_blind)
-        cause = f"every step with an observation was degenerate{which}: no particle had any"
-        cause += " likelihood; mpfjax.check_model tries a model out"
+        cause = f"every step with an observation was degenerate{which}: every particle had zero"
+        cause += " likelihood; mpfjax.check_model tests a model"
         warn(cause)
     weighed = (np.asarray(increments) != 0) & ~degenerate
     num_weighed, is_alone = weighed.sum(axis=-1), np.asarray(run.effective_sample_size) < 2
@@ -214,9 +214,9 @@ def sound(run: FilterRun, free: bool = True) -> FilterRun:
         is_lost = alarm[..., -1]
         which = _in_how_many(is_lost)
         first = int(np.argmax(alarm.reshape(-1, alarm.shape[-1]).any(axis=0)))
-        cause = f"at the end, what was observed speaks against all hypotheses{which}, first at"
+        cause = f"at the end, the observations speak against all hypotheses{which}, first at"
         cause += f" index {first} of the steps: run.alarm; mpfjax.with_restarts lets the state"
-        warn(f"{cause} begin anew")
+        warn(f"{cause} restart")
     return run
 
 
@@ -234,7 +234,7 @@ def warn_of_start(run: FilterRun, filter: Filter) -> FilterRun:
     looked_at = np.asarray(weights).reshape(-1, weights.shape[-1])[:_MOST_LOOKED_AT]
     if np.mean([chosen[0].is_wide(each) for each in looked_at]) > 0.5:
         cause = f"hardly any draw of x_0 fits the first observation, of {chosen[0].num_draws} for"
-        cause += " each particle, so that chance decides which modes live and their masses."
-        cause += " mpfjax.with_initialisation begins with a sampler on the first observations; it"
+        cause += " each particle, so that chance decides which modes survive and their weights."
+        cause += " mpfjax.with_initialisation samples x_0 given the first observations; it"
         warn(f"{cause} needs the density of x_0, log_initial, in the model")
     return run

@@ -58,7 +58,7 @@ def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
     """
     (arrays, saved), expected = read_described(path), describe(like)
     if saved != expected:
-        raise ValueError(f"like: {path} holds another state: {differences(saved, expected)}")
+        raise ValueError(f"like: {path} contains another state: {differences(saved, expected)}")
     return tree_of_arrays(path, arrays, like)
 
 

@@ -124,7 +124,9 @@ def run_study(
     directory = Path(directory)
     cells, identity = _cells(study), _identity(study)
     if _cell_files(directory) and not resume:
-        raise ValueError(f"directory: {directory} holds {_summary(directory)}; say resume to go on")
+        raise ValueError(
+            f"directory: {directory} holds {_summary(directory)}; resume=True continues"
+        )
     results = _read_cells(directory, identity)
     pending = [cell for cell in cells if cell.file not in results]
     if results and jax.process_index() == 0:

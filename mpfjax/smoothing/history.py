@@ -23,7 +23,7 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     is_run = isinstance(run, FilterRun)
     mixtures = run.collected if is_run else run
     if not isinstance(mixtures, ParticleMixture) or mixtures.log_weights.ndim != 2:
-        raise ValueError("mixtures: these are not all of one run; keep them by collect=None")
+        raise ValueError("mixtures: not those of a whole run; run the filter with collect=None")
     # Smoothing does not use the moves' memory, whose leaves may not stack.
     mixtures = jax.vmap(lambda mixture: mixture.replace(memory={}))(mixtures)
     began_anew = jax.vmap(lambda mixture: mixture.began_anew)(mixtures)

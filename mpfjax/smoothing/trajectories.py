@@ -126,7 +126,7 @@ def _check_component(mixtures: ParticleMixture, component: int) -> None:
     active = jax.tree.map(lambda leaf: leaf[-1], mixtures).active
     alive = range(component + 1) if isinstance(active, Tracer) else np.flatnonzero(active)
     if component not in alive:
-        raise ValueError(f"component: {component} is dead at the end; alive are {[*alive]}")
+        raise ValueError(f"component: {component} is empty at the last step; active are {[*alive]}")
 
 
 @jit_on_wide_vectors

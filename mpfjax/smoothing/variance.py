@@ -168,7 +168,7 @@ def _with_lineage(run: FilterRun | ParticleMixture) -> ParticleMixture:
     """The last mixture of a run; a `ValueError` unless it has Eve indices in common."""
     mixture = run.final if isinstance(run, FilterRun) else run
     if EVE_INDICES not in mixture.memory:
-        raise ValueError("run: its filter keeps no Eve indices; run with_eve_indices of it")
+        raise ValueError("run: its filter stores no Eve indices; build it by with_eve_indices")
     if mixture.memory[EVE_INDICES].indices.ndim != 1:
         raise ValueError("run: islands, or several runs, have no Eve indices in common")
     return mixture
@@ -219,7 +219,7 @@ def batch_estimate(
     """
     number = runs.log_marginal_likelihood.size
     if runs.log_marginal_likelihood.ndim != 1 or number < FEWEST_RUNS:
-        raise ValueError(f"runs: {number}; a standard error asks for {FEWEST_RUNS} at least")
+        raise ValueError(f"runs: {number}; a standard error requires at least {FEWEST_RUNS}")
     logs = runs.log_marginal_likelihood
     values = jax.vmap(quantity)(runs.final)
     # Each run is left out in turn; a difference of sums would be lost to rounding.

@@ -104,7 +104,7 @@ class TestManyDevices:
         told = started["eight"][1]
         assert told["too many"] == "devices: 9 are not some of the 8 devices"
         assert "are not some of the 8 devices" in told["twice"]
-        assert "cannot be dealt to 3 devices" in told["uneven"]
+        assert "cannot be split over 3 devices" in told["uneven"]
         assert told["only device"]
 
 

@@ -39,5 +39,5 @@ def test_steps_taken_again_are_those_of_a_filter_that_had_it_in_time_to_the_bit(
     mean, error = float(exact.means[-1, 0]), float(exact.covariances[-1, 0, 0]) ** 0.5
     assert float(found.mixture.mean()[0]) == pytest.approx(mean, abs=6 * error / 4000**0.5)
     assert (lacking.mixture.log_weights != found.mixture.log_weights).any()
-    with pytest.raises(ValueError, match="steps_ago: 4, and 4 steps are kept"):
+    with pytest.raises(ValueError, match="steps_ago: 4, and 4 steps are stored"):
         replay.late(found, SEEN[1], 4)

@@ -354,7 +354,7 @@ REFUSED = (
      lambda: Resample(particles_per_component=2, group=nothing)),
     ("moves: (?s:.*) neither regroups, resamples nor",
      lambda: mpfjax.Every(2, [KMeans(), Propagate()])),
-    ("moves: two of them keep the memory 'every 2: KMeans', as Every", lambda: FILTER.replace(
+    ("moves: two of them use the memory 'every 2: KMeans', as Every", lambda: FILTER.replace(
         moves=[*FILTER.moves, *(mpfjax.Every(2, [KMeans(k)]) for k in (1, 2))])),
     ("group: it returned", lambda: mpfjax.GroupBy(lambda x: jnp.zeros(2, int))(KEY, MIXTURE)),
     ("importance: .* draws from no proposal", lambda: mpfjax.gaussian_particle_filter(
@@ -448,7 +448,7 @@ REFUSED = (
      lambda: Filter(changed(Drift, sample_transition=lambda self, key, x: x),
                     [Propagate(noise="rqmc")], 4)),
     *(
-        (f"a model, and {kind.__name__} holds none; the filter has its own",
+        (f"a model, but {kind.__name__} stores none; the filter has its own",
          lambda kind=kind: kind(MODEL))
         for kind in (Propagate, mpfjax.PropagateMarginalised, mpfjax.Partitioned,
                      mpfjax.GaussNewtonProposal, SelectInitial)
@@ -492,8 +492,8 @@ REFUSED = (
     ("filter: .* is approximate or draws in a way of its own", lambda:
         mpfjax.with_eve_indices(mpfjax.distributed_partitioned_sampling(JOINT, 4))),
     (r"filter: scheme of \w+ is '", lambda: mpfjax.with_eve_indices(OF_SCALAR)),
-    ("run: its filter keeps no Eve", lambda: log_marginal_likelihood_variance(HISTORY)),
-    ("runs: 1; a standard error asks for 4", lambda: batch_estimate(HISTORY, nothing)),
+    ("run: its filter stores no Eve", lambda: log_marginal_likelihood_variance(HISTORY)),
+    ("runs: 1; a standard error requires at least 4", lambda: batch_estimate(HISTORY, nothing)),
     # tuning
     (r"num_samples: 800 .* num_moves \+ 1: 798 or 804", lambda: tuning.smc2(
         KEY, OF_SCALAR, TWO, 800, sample_prior=nothing, log_prior=nothing, **OF_A)),
@@ -555,7 +555,7 @@ MISTAKEN = (
      lambda: mpfjax.particle_filter(Still(), 4)),
     ("model: Plain defines no sample_initial, which a filter needs; is sample_prior meant",
      lambda: mpfjax.particle_filter(Plain(), 4)),
-    ("model: a Filter is no model, and holds one", lambda: mpfjax.particle_filter(FILTER, 4)),
+    ("model: a Filter is no model, but has one", lambda: mpfjax.particle_filter(FILTER, 4)),
     (r"features: shape \(3,\) is not \(20, ...\)", lambda: run(mpfjax.mixture_particle_filter(
         MODEL, 20, 2, features=lambda states: states[:3]))),
     (r"features: \(f32\[20\], .* is no array of numbers", lambda: run(

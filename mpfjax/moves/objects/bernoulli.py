@@ -112,7 +112,7 @@ class Associate(AbstractWrapper):
         """Raise a `ValueError` for a model of another kind, and if there is no room for objects."""
         check(TargetsModel, model=now.model)
         if num_components < 2:
-            raise ValueError("num_components: 1 is that of objects not detected; it has no other")
+            raise ValueError("num_components: 1 leaves no component for detected objects")
         size, least = self.undetected_particles, self.undetected_particles + num_components - 1
         if num_particles < least:
             which = f"is less than {least}, {size} undetected_particles and one for each object"

@@ -49,7 +49,7 @@ def estimate_targets(mixture: ParticleMixture, q: Sequence[float] = ()) -> Targe
     `track_table` for a table of a whole run.
     """
     if TARGETS not in mixture.memory:
-        raise ValueError("mixture: it is of no bernoulli_filter")
+        raise ValueError("mixture: it is not from a bernoulli_filter")
     memory, values = mixture.memory[TARGETS], flatten_states(mixture.particles)
     existence = memory["number"] * mixture.mixture_weights
     of_each = jnp.minimum(existence[1:], 1.0)
@@ -103,7 +103,7 @@ def track_table(run: TargetEstimates) -> dict[str, np.ndarray]:
     lost = np.asarray(run.crowded_out)
     if len(steps := np.flatnonzero(lost >= _LEAST_EXISTENCE)):
         at = f"at step {steps[0] + 1} for {lost[steps[0]]:.1f} objects"
-        warn(f"max_targets: there was no room {at}; they are not told apart")
+        warn(f"max_targets: there was no room {at}; they are not distinguished")
     existence, labels = np.asarray(run.existence), np.asarray(run.labels)
     steps, places = np.nonzero((existence >= _LEAST_EXISTENCE) & (labels > 0))
     flat = jax.vmap(flatten_states)(run.means)

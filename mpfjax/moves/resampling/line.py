@@ -238,7 +238,7 @@ def _coordinates(mixture: ParticleMixture, sort_by: SortBy) -> Array:
         raise ValueError(f"sort_by: it returned {shown(values)}, no real array")
     if values.ndim not in (1, 2) or values.shape[0] != n or values.size == 0:
         raise ValueError(
-            f"sort_by: it returned shape {values.shape}, not a number a particle, ({n},), nor"
+            f"sort_by: it returned shape {values.shape}, not a number per particle, ({n},), nor"
             f" a few, ({n}, d)"
         )
     return jnp.asarray(values).reshape(n, -1).T

@@ -88,7 +88,7 @@ class Resample(AbstractResampling):
 
     def __check_init__(self) -> None:
         if self.group is not None and self.particles_per_component is not None:
-            raise ValueError("group: groups have no effect beside particles_per_component")
+            raise ValueError("group: groups have no effect together with particles_per_component")
 
     approximate = False
 

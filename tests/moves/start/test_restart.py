@@ -300,7 +300,7 @@ def test_an_alarm_is_given_where_all_hypotheses_are_wrong(name, told):
     assert alarm[:, 20:23].any(axis=1).all()
     assert not alarm[:, :20].any()
     assert not np.asarray(calm.alarm).any()
-    said = [each for each in messages if "speaks against all hypotheses in 8 of 8 runs" in each]
+    said = [each for each in messages if "speak against all hypotheses in 8 of 8 runs" in each]
     assert len(said) == (name == "alarm")
     assert not silence
 
