@@ -83,7 +83,7 @@ def conditional_filter(
     `AuxiliaryResample`, `Propagate`, `Predict`, `Reweight` and `Every` of these; a conditionally
     linear model; a proposal without `log_density`; noise that is not independent; a model without
     `log_transition`, unless `backward` is false; a trajectory of other shapes or types than the
-    model's states, or of density zero (RuntimeError within jit). Use it in your own Gibbs sampler;
+    model's states, or of density zero (NaN within jit). Use it in your own Gibbs sampler;
     `mpfjax.tuning.particle_gibbs` is one for parameters.
     """
     check_conditional(filter, backward, "conditional_filter")

@@ -18,7 +18,7 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     """The stacked mixtures of a run; with those of a whole `FilterRun` x_0 comes first.
 
     Raises `ValueError` for anything but a stack of mixtures, for a stack of several runs, and where
-    states began anew (RuntimeError within jit).
+    states began anew (NaN within a caller's jit).
     """
     is_run = isinstance(run, FilterRun)
     mixtures = run.collected if is_run else run
@@ -91,7 +91,7 @@ def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
 
     `mixtures` is a run of `run_filter(..., collect=None)`, whose first time is then x_0, or the
     mixtures that it collected, whose first time is x_1. Raises `ValueError` for anything else, and
-    if particles have no single ancestors, as after restarts (an index below 0; RuntimeError within
+    if particles have no single ancestors, as after restarts (an index below 0; NaN within
     jit). Use it to see how far back the history of a mode reaches. Resampling leaves few ancestors
     at early times; `sample_trajectories` draws new ones.
     """
