@@ -95,7 +95,7 @@ class Filter(eqx.Module):
             raise ValueError(f"num_particles: {self.num_particles} {which}")
         if not any(move.weighs for move in self.moves):
             who = f"moves: {', '.join(map(name_of, self.moves)) or 'none'}"
-            raise ValueError(f"{who} never weight the particles by y_t, as Propagate does")
+            raise ValueError(f"{who} never weigh the particles by what is observed, as Propagate")
         now = self._now()
         for move in (*self.initial_moves, *self.moves):
             move.check(now, self.num_particles, self.num_components)

@@ -43,7 +43,7 @@ def draw_components(
     time. Use it to see where modes part, and how much of the mass each has.
     """
     if mixtures.log_weights.ndim != 2:
-        raise ValueError("mixtures: not those of a whole run; run the filter with collect=None")
+        raise ValueError("mixtures: these are not all of one run; keep them by collect=None")
 
     def moments(mixture: ParticleMixture) -> tuple[Array, Array, Array]:
         means = flatten_states(mixture.component_means())
