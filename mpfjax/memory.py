@@ -43,6 +43,9 @@ class Memory(eqx.Module):
     def check_run(self, num_steps: int) -> None:
         """Raise a `ValueError` for a run of fewer steps than the memory needs."""
 
+    def check_past(self) -> None:
+        """Raise a `ValueError` if some state has no past among the particles in any case."""
+
     def warning(self) -> str:
         """What a run that ends with this memory has to warn of; nothing by default."""
         return ""
@@ -70,6 +73,13 @@ def check_run(memory: dict[str, PyTree], num_steps: int) -> None:
     for entry in memory.values():
         if isinstance(entry, Memory):
             entry.check_run(num_steps)
+
+
+def check_past(memory: dict[str, PyTree]) -> None:
+    """Raise a `ValueError` for a memory by which a run cannot be smoothed."""
+    for entry in memory.values():
+        if isinstance(entry, Memory):
+            entry.check_past()
 
 
 def warnings_of(memory: dict[str, PyTree]) -> list[str]:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.checks import checked
+from mpfjax.memory import check_past
 from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.observations import refuse_where
 from mpfjax.operations.stored import count_places, take
@@ -24,6 +25,7 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     mixtures = run.collected if is_run else run
     if not isinstance(mixtures, ParticleMixture) or mixtures.log_weights.ndim != 2:
         raise ValueError("mixtures: not those of a whole run; run the filter with collect=None")
+    check_past(mixtures.memory)
     # Smoothing does not use the moves' memory, whose leaves may not stack.
     mixtures = jax.vmap(lambda mixture: mixture.replace(memory={}))(mixtures)
     began_anew = jax.vmap(lambda mixture: mixture.began_anew)(mixtures)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.checks import Checked, CountOrZero, check_one_each, checked, saying
 from mpfjax.filter import Filter, check_keep_parents
+from mpfjax.memory import check_past
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import over_particles, require, with_inputs
 from mpfjax.models.law import refuse_marginalised
@@ -107,6 +108,7 @@ def _smooth(key, smoother, series, lag):
     length, filter, num_rows = series.length, smoother.filter, smoother.lag + 1
     step_keys = jax.random.split(key_steps, length)
     initial = first_mixture(key_initial, filter, series)
+    check_past(initial.memory)
     terms = smoother._no_terms(initial.particles)
 
     def advance(carry: tuple[ParticleMixture, "Terms"], step: PyTree) -> Any:
@@ -205,6 +207,7 @@ class FixedLagSmoother(Checked):
 
     def init(self, mixture: ParticleMixture) -> Window:
         """The initial window: at the mixture of `Filter.init`, or at any later one."""
+        check_past(mixture.memory)
         return Window(mixture, self._no_terms(mixture.particles), jnp.zeros((), jnp.int32))
 
     @checked

@@ -125,14 +125,19 @@ RULES = (
          filters=GAUSSIAN | JOINT | these("IslandInteraction"), questions=OF_PARENTS),
     Rule("cannot keep a trajectory|independent|one Propagate|approximate",
          "conditional SMC and particle Gibbs support only `Resample`, `Propagate` and regrouping",
-         filters=GAUSSIAN | OF_OBJECTS | METROPOLIS
+         filters=GAUSSIAN | OF_OBJECTS | METROPOLIS | BEGUN
          | these("point sets", "two draws", "PropagateNested", "Bernoulli",
                  "PropagateRegimes", "own function", "Prune", "Exclusion"),
          questions=OF_PATHS),
     Rule("unbiased likelihood",
          "`metropolis_hastings` and `smc2` refuse filters that are `approximate`",
          filters=APPROXIMATE, questions=UNBIASED),
-    Rule("slots", "filters of separate objects need every slot", filters=JOINT,
+    Rule("cannot be smoothed", "a run with a start cannot be smoothed: its state is drawn anew",
+         filters=these("start"),
+         questions=these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "genealogy")),
+    Rule("no particle one parent", "", filters=BEGUN, questions=these("sums, mcmc")),
+    Rule("slots", "filters of separate objects, a start and restarts need every slot",
+         filters=JOINT | BEGUN,
          questions=these("slots")),
     Rule("nearly all weight|hardly any draw|degenerate",
          "a prior that is 100 000 times broader than the likelihood causes a warning; a "

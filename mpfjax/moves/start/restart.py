@@ -65,6 +65,12 @@ class RecentSteps(Memory):
             which = f"fewer than num_observations of with_initialisation, {self.start}"
             raise ValueError(f"observations: {num_steps} steps, {which}")
 
+    def check_past(self) -> None:
+        """Raise a `ValueError` if the state is drawn anew at a step of every run."""
+        if self.start:
+            said = f"with_start draws the state anew at step {self.start}"
+            raise ValueError(f"filter: {said}, so that a run cannot be smoothed")
+
     def warning(self) -> str:
         """Where the powers of a likelihood ran out."""
         sampler = "the sampler of with_initialisation and with_restarts"
