@@ -123,7 +123,7 @@ RULES = (
          "genealogies and the method \"mcmc\" of smoothers need single ancestors: no Gaussian "
          "regeneration, islands or filters of separate objects",
          filters=GAUSSIAN | JOINT | these("IslandInteraction"), questions=OF_PARENTS),
-    Rule("cannot keep a trajectory|independent|one Propagate|approximate",
+    Rule("cannot keep a trajectory|cannot be smoothed|independent|one Propagate|approximate",
          "conditional SMC and particle Gibbs support only `Resample`, `Propagate` and regrouping",
          filters=GAUSSIAN | OF_OBJECTS | METROPOLIS | BEGUN
          | these("point sets", "two draws", "PropagateNested", "Bernoulli",
