@@ -2,6 +2,7 @@
 
     python -m benchmarks.scaling
     python -m benchmarks.scaling --axes components --particles 1000      # a mixture's price
+    python -m benchmarks.scaling --against HEAD~5 --particles 1000 10000 # what commits changed
     python -m benchmarks.scaling --axes --islands 10000128               # one filter, as islands
 
 The quadratic model, whose likelihood costs next to nothing, so that what is seen is the filter;
@@ -22,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from benchmarks import harness
+from benchmarks import commits, harness
 from benchmarks.harness import Count, command, data, nothing, pivot, table, turns
 from mpfjax.operations.compiling import cpu_options
 
@@ -60,6 +61,7 @@ def main(
     steps: Sequence[Count] = (50, 150, 450),
     islands: Annotated[Sequence[Count], "*"] = (),
     repeats: Count = 5,
+    against: str = "",
     out: Path = Path("results/scaling"),
 ) -> None:
     """Axis after axis, each written as it is finished.
@@ -68,7 +70,13 @@ def main(
     - `particles`: the first is N where another axis is varied, likewise below.
     - `islands`: particles of one filter.
     - `repeats`: times that each cell is timed.
+    - `against`: a commit, whose filters run in turns with these; nothing else is timed.
     """
+    if against:
+        entries = commits.ratios(against, particles, repeats)
+        print(f"time over that of {against}, {commits.processor()}\n\n{table(None, entries)}")
+        data(out / "against.json", settings=harness.settings_of(locals()), results=entries)
+        return
     if uneven := [number for number in islands if number % NUM_ISLANDS**2]:
         raise ValueError(f"--islands: {uneven[0]} is not a positive multiple of {NUM_ISLANDS**2}")
     content: dict[str, Any] = {"settings": harness.settings_of(locals()), "results": []}
