@@ -68,7 +68,8 @@ def _worker(folder: Path) -> Iterator[tuple[IO[str], IO[str]]]:
     command = [sys.executable, __file__, str(folder)]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, cwd=folder, stdin=pipe, stdout=pipe, text=True) as process:
-        assert process.stdin is not None and process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout is not None
         yield process.stdin, process.stdout
         process.stdin.close()
 

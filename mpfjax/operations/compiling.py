@@ -1,9 +1,14 @@
 """Compilation: on wide vectors, once for all values of a model's floats."""
 
+import contextlib
 import functools
+import logging
 import os
+import sys
 import threading
-from collections.abc import Callable
+import time
+import traceback
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -77,7 +82,8 @@ def jit_on_wide_vectors(
             with one_at_a_time:  # or several threads would each compile the program
                 compiled = wide()
             try:
-                return compiled(*arguments, **named)
+                with _watched(function):
+                    return compiled(*arguments, **named)
             except ValueError as error:
                 # All arguments are constants of the caller's program, or a function among them
                 # closes over a tracer.
@@ -109,6 +115,62 @@ def _older_emitters() -> dict[str, int | str]:
     except jax.errors.JaxRuntimeError:
         return {}
     return options
+
+
+@contextlib.contextmanager
+def _watched(function: Callable[..., PyTree]) -> Iterator[None]:
+    """Within it, a line is logged if the function is still being compiled after some seconds.
+
+    One thread watches all calls, since a thread for each would take longer than a short step.
+    """
+    caller = threading.get_ident()
+    if not _watchers:
+        _watchers.append(threading.Thread(target=_watch, daemon=True))
+        _watchers[0].start()
+    outermost = caller not in _calls
+    if outermost:
+        _calls[caller] = (time.monotonic(), function)
+        _has_calls.set()
+    try:
+        yield
+    finally:
+        if outermost:
+            _calls.pop(caller, None)
+
+
+def _watch() -> None:
+    """Log a line for each call whose thread is in JAX's compiler after some seconds."""
+    told: set[float] = set()
+    while _has_calls.wait():
+        time.sleep(PATIENCE / 4)
+        if not _calls:
+            _has_calls.clear()
+            told.clear()
+            if _calls:  # one that came in between
+                _has_calls.set()
+        for caller, (start, function) in list(_calls.items()):
+            frame = sys._current_frames().get(caller)
+            if start in told or time.monotonic() - start < PATIENCE or frame is None:
+                continue
+            modules = {at.f_globals.get("__name__") for at, _ in traceback.walk_stack(frame)}
+            if modules & _COMPILERS:
+                told.add(start)
+                _logger.warning(_WAITING, f"{function.__module__}.{function.__qualname__}")
+
+
+PATIENCE = 3.0
+"""Seconds of compiling after which a line says so."""
+_WAITING = (
+    "compiling %s for more than three seconds; later calls with the same shapes do not wait, and"
+    " mpfjax.keep_programs() keeps programs for later processes. Silence this by"
+    " logging.getLogger('mpfjax').setLevel('ERROR')"
+)
+_COMPILERS = {f"jax._src.{name}" for name in ("compiler", "interpreters.partial_eval",
+                                              "interpreters.mlir")}  # fmt: skip
+_logger = logging.getLogger("mpfjax")
+_calls: dict[int, tuple[float, Callable[..., PyTree]]] = {}
+_watchers: list[threading.Thread] = []
+_has_calls = threading.Event()
 
 
 def is_traced(tree: PyTree) -> bool:

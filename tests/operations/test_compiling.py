@@ -1,5 +1,7 @@
 """Programs that are kept from process to process."""
 
+import time
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ from jax.experimental.compilation_cache import compilation_cache
 import mpfjax
 from mpfjax import enable_compilation_cache
 from mpfjax.filter import Filter
+from mpfjax.operations import compiling
 
 SETTINGS = [
     "jax_compilation_cache_dir",
@@ -72,3 +75,21 @@ def test_a_step_says_what_it_saw_and_its_program_calls_nothing_back(transform):
         assert step(jnp.full((), jnp.nan))[1].broken
     info = jax.vmap(step)(jnp.array([1.0, jnp.inf]))[1]
     np.testing.assert_array_equal(info.broken, [False, True])
+
+
+def test_a_line_is_logged_while_a_program_is_compiled(monkeypatch, caplog):
+    """Once, and not where the program is there already."""
+    monkeypatch.setattr(compiling, "PATIENCE", 0.1)
+
+    def slow(x):
+        time.sleep(0.6)  # as it is traced
+        return x + 1
+
+    program = compiling.jit_on_wide_vectors(slow)
+    program(jnp.ones(2))
+    lines = [record.getMessage() for record in caplog.records if record.name == "mpfjax"]
+    assert len(lines) == 1
+    assert "slow for more than" in lines[0]
+    assert "keep_programs" in lines[0]
+    program(jnp.zeros(2))
+    assert len([record for record in caplog.records if record.name == "mpfjax"]) == 1
