@@ -162,7 +162,7 @@ PATIENCE = 3.0
 """Seconds of compiling after which a line says so."""
 _WAITING = (
     "compiling %s for more than three seconds; later calls with the same shapes do not wait, and"
-    " mpfjax.keep_programs() keeps programs for later processes. Silence this by"
+    " mpfjax.enable_compilation_cache() keeps programs for later processes. Silence this by"
     " logging.getLogger('mpfjax').setLevel('ERROR')"
 )
 _COMPILERS = {f"jax._src.{name}" for name in ("compiler", "interpreters.partial_eval",

@@ -90,6 +90,6 @@ def test_a_line_is_logged_while_a_program_is_compiled(monkeypatch, caplog):
     lines = [record.getMessage() for record in caplog.records if record.name == "mpfjax"]
     assert len(lines) == 1
     assert "slow for more than" in lines[0]
-    assert "keep_programs" in lines[0]
+    assert "enable_compilation_cache" in lines[0]
     program(jnp.zeros(2))
     assert len([record for record in caplog.records if record.name == "mpfjax"]) == 1
