@@ -185,8 +185,13 @@ def test_smoothing_refuses_a_run_in_which_a_state_began_anew():
 
 @pytest.mark.exactness
 def test_online_smoothing_ends_where_a_state_begins_anew():
-    with pytest.raises(RuntimeError, match="restarts"):
-        smoothed_sums(KEY, FILTER, CARRIED, lambda before, now: now[:, 0])
+    """At a restart, or before the run where the state begins anew in any case."""
+    for filter, error, text in (
+        (restarts(PLAIN), RuntimeError, "restarts"),
+        (FILTER, ValueError, "cannot be smoothed"),
+    ):
+        with pytest.raises(error, match=text):
+            smoothed_sums(KEY, filter, CARRIED, lambda before, now: now[:, 0])
 
 
 def test_derivatives_are_refused():
