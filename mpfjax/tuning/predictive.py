@@ -10,7 +10,7 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.checks import Count, checked
 from mpfjax.models.base import require
 from mpfjax.models.observations import steps_of_inputs
-from mpfjax.models.trial import steps_ahead
+from mpfjax.models.simulation import steps_ahead
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.tuning.happened import Chains, drawn_states
 

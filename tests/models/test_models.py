@@ -96,6 +96,8 @@ def test_series_of_one_particle_of_several_objects_and_with_inputs():
     assert noise.std() == pytest.approx(0.1, abs=4 * 0.1 / np.sqrt(300))
     states, _ = mpfjax.simulate(KEYS[2], Driven(), 4, inputs=jnp.arange(4.0))
     np.testing.assert_allclose(np.diff(states[:, 0]), np.arange(4.0), atol=1e-6)
+    with pytest.raises(TypeError, match=r"model: Driven\.\w+.*its inputs None, as the call"):
+        mpfjax.simulate(KEYS[2], Driven(), 4)
 
 
 def test_objects_that_interact_cannot_be_simulated():

@@ -5,7 +5,6 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from jax.scipy.special import logsumexp
 from jax.scipy.stats import cauchy, expon, norm, poisson, uniform
@@ -17,6 +16,77 @@ from tests.user_models import DRIFT_AS_LINEAR_GAUSSIAN, Drift, DriftOfOne, Scala
 
 NUMBER = jnp.asarray(0.3)
 ONE = mpfjax.LinearGaussianModel(A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]])
+
+
+class Observed(Drift):
+    """With the two methods that only some tasks need."""
+
+    def log_initial(self, states):
+        return norm.logpdf(states).sum(axis=1)
+
+    def sample_observation(self, key, states):
+        return states[:, 0] + 0.7 * jax.random.normal(key, (len(states),))
+
+
+class Returns(mpfjax.AbstractStateSpaceModel):
+    """The state is the log variance of what is observed."""
+
+    def sample_initial(self, key, num_particles):
+        return -0.5 + jax.random.normal(key, (num_particles,))
+
+    def sample_transition(self, key, states):
+        return 0.97 * states + 0.25 * jax.random.normal(key, states.shape)
+
+    def log_initial(self, states):
+        return norm.logpdf(states, -0.5, 1.0)
+
+    def log_transition(self, states, previous_states):
+        return norm.logpdf(states, 0.97 * previous_states, 0.25)
+
+    def log_likelihood(self, observation, states):
+        return norm.logpdf(observation, 0.0, jnp.exp(states / 2))
+
+    def sample_observation(self, key, states):
+        return jnp.exp(states / 2) * jax.random.normal(key, states.shape)
+
+
+class Plotted(Observed):
+    """A place in the plane, by its range and bearing."""
+
+    def log_likelihood(self, observation, states):
+        far, angle = jnp.linalg.norm(states, axis=1), jnp.arctan2(states[:, 1], states[:, 0])
+        errors = observation[None] - jnp.stack([far, angle], axis=1)
+        return norm.logpdf(errors, 0.0, jnp.array([[0.5, 0.1]])).sum(axis=1)
+
+
+def polar(key, plot, n):
+    """Places around a range and a bearing, and their log density in the plane."""
+    errors = jnp.array([[0.5, 0.1]]) * jax.random.normal(key, (n, 2))
+    far, angle = (plot[None] + errors).T
+    log_polar = norm.logpdf(errors, 0.0, jnp.array([[0.5, 0.1]])).sum(axis=1)
+    return far[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], 1), log_polar - jnp.log(far)
+
+
+def radar(locate):
+    """Objects that come and go in a disc, whose plots are ranges and bearings."""
+    sensor = mpfjax.ClutteredModel(Plotted(), 0.9, 0.01)
+    region = mpfjax.Disc([0.0, 0.0], 100.0)
+    birth = mpfjax.UniformBirth(0.1, region, lambda key, places: places, locate)
+    return mpfjax.TargetsModel(sensor, birth)
+
+
+PLOTS = jnp.array([[jnp.nan, jnp.nan], [30.0, 0.5]])
+
+
+class Guess(mpfjax.AbstractProposal):
+    """Draws between the prediction and the observation."""
+
+    scale: float = 0.6
+
+    def propose(self, key, now, previous_states):
+        noise = jax.random.normal(key, previous_states.shape)
+        mean = 0.5 * (now.model.transition_mean(previous_states) + now.observation)
+        return mean + 0.6 * noise, norm.logpdf(noise * 0.6, 0.0, self.scale).sum(axis=1)
 
 
 class Known(Drift):
@@ -177,6 +247,9 @@ RIGHT = {
     "births and deaths": (BirthsAndDeaths(), NUMBER),
     **{name: (step, NUMBER) for name, step in STEPS.items()},
     "batched": (Drift(), NUMBER),
+    "observed": (Observed(), NUMBER),
+    "returns": (Returns(), NUMBER),
+    "objects": (radar(polar), PLOTS),
     "x_0 known": (Known(), NUMBER),
     "regimes": (Regimes(), NUMBER),
     "marginalised": (switching.MODEL, switching.OBSERVATIONS[0]),
@@ -188,7 +261,7 @@ RIGHT = {
 }
 
 
-QUICK = ["x_0 known", "births and deaths", "volatile"]
+QUICK = ["x_0 known", "births and deaths", "returns"]
 
 
 def is_accepted(name, num_keys, recwarn):
@@ -236,11 +309,11 @@ WRONG = {
     ),
     "another deviation": (
         Drift, {"log_transition": lambda self, x, old: normal(x, self.transition_mean(old), 0.8)},
-        "is not the density of sample_transition",
+        "is not the log density of sample_transition",
     ),
     "another mean": (
         Drift, {"log_transition": lambda self, x, old: normal(x, old, 0.5)},
-        "is not the density of sample_transition",
+        "is not the log density of sample_transition",
     ),
     "a factor of the past": (
         Volatile,
@@ -276,6 +349,72 @@ def test_what_is_wrong_is_named(name):
         mpfjax.check_model(jax.random.key(0), type("Changed", (base,), methods)(), NUMBER)
 
 
+def squared(scale):
+    """A normal log density without its normaliser."""
+    return lambda x, mean: -0.5 * ((x - mean) / scale) ** 2
+
+
+def step(log_density):
+    return lambda self, x, old: log_density(x, 0.97 * old)
+
+
+# By name: the class that is right, and the method with one fault that a user makes.
+PLANTED = {
+    "a wrong sign": (Observed, "log_likelihood", lambda self, y, x: -squared(0.7)(y, x[:, 0])),
+    "a density": (Observed, "log_likelihood", lambda self, y, x: norm.pdf(y, x[:, 0], 0.7)),
+    "a variance": (Observed, "log_likelihood", lambda self, y, x: norm.logpdf(y, x[:, 0], 0.49)),
+    "another number": (Observed, "log_likelihood", lambda self, y, x: norm.logpdf(y, x[:, 1], 0.7)),
+    "no normaliser": (Returns, "log_likelihood", lambda self, y, x: squared(jnp.exp(x / 2))(y, 0)),
+    "a variance for a scale": (
+        Returns, "log_likelihood", lambda self, y, x: norm.logpdf(y, 0, jnp.exp(x)),
+    ),
+    "another x_0": (Observed, "log_initial", lambda self, x: norm.logpdf(x, 0.0, 2.0).sum(axis=1)),
+    "half of x_0": (Observed, "log_initial", lambda self, x: norm.logpdf(x[:, 0])),
+    "a density of x_0": (Returns, "log_initial", lambda self, x: norm.pdf(x, -0.5, 1.0)),
+    "a density of x_t": (Returns, "log_transition", step(lambda x, m: norm.pdf(x, m, 0.25))),
+    "a variance of x_t": (Returns, "log_transition", step(lambda x, m: norm.logpdf(x, m, 0.0625))),
+    "no constant": (Returns, "log_transition", step(squared(0.25))),
+    "one noise for all y": (
+        Observed, "sample_observation",
+        lambda self, key, x: x[:, 0] + 0.7 * jax.random.normal(key),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", quick_of(PLANTED, ["no normaliser", "another x_0"]))
+def test_a_planted_fault_is_reported(name):
+    base, method, faulty = PLANTED[name]
+    model = type("Faulty", (base,), {method: faulty})()
+    with pytest.raises(ValueError, match=f"model: Faulty.{method} "):
+        mpfjax.check_model(jax.random.key(0), model, NUMBER)
+
+
+def without_jacobian(key, plot, n):
+    places, log_density = polar(key, plot, n)
+    return places, log_density + jnp.log(jnp.linalg.norm(places, axis=1))
+
+
+def as_density(key, plot, n):
+    places, log_density = polar(key, plot, n)
+    return places, jnp.exp(log_density)
+
+
+@pytest.mark.exactness
+@pytest.mark.parametrize("locate", [without_jacobian, as_density])
+def test_places_of_new_objects_with_another_density_are_reported(locate):
+    with pytest.raises(ValueError, match=r"birth\.locate's log density is not"):
+        mpfjax.check_model(jax.random.key(0), radar(locate), PLOTS)
+
+
+@pytest.mark.exactness
+def test_a_proposal_must_have_the_density_of_its_draws():
+    key = jax.random.key(0)
+    mpfjax.check_model(key, Observed(), NUMBER, proposal=Guess())
+    mpfjax.check_model(key, Observed(), NUMBER, proposal=mpfjax.GaussNewtonProposal())
+    with pytest.raises(ValueError, match=r"proposal: Guess\.propose is not the log density"):
+        mpfjax.check_model(key, Observed(), NUMBER, proposal=Guess(0.36))
+
+
 class Sensors(Drift):
     """Two readings with one gain, either of which may be missing."""
 
@@ -309,41 +448,3 @@ def test_a_missing_number_must_leave_the_likelihood_and_its_derivative_finite(re
         mpfjax.check_model(key, Careless(), seen)
     with pytest.raises(ValueError, match=r"Forgotten.*NaN where a number is missing"):
         mpfjax.check_model(key, Forgotten(), seen)
-
-
-class Near(Drift):
-    """No particle further than this has any likelihood."""
-
-    def log_likelihood(self, observation, states):
-        return jnp.where(jnp.abs(observation - states[:, 0]) < 5.0, 0.1, -jnp.inf)
-
-
-@pytest.mark.exactness
-def test_a_run_without_any_likelihood_says_so_once(recwarn):
-    filter = mpfjax.particle_filter(Near(), 20)
-    keys, far = jax.random.split(jax.random.key(0), 3), np.array([90.0, np.nan, 80.0])
-    mpfjax.run_filter(keys[0], filter, np.array([90.0, 0.0, 80.0]))  # one step is enough
-    assert not recwarn.list
-    with pytest.warns(RuntimeWarning, match="every step with an observation was degenerate:"):
-        mpfjax.run_filter(keys[0], filter, far, missing="skip")
-    with pytest.warns(RuntimeWarning, match="degenerate in 3 of 3 runs") as found:
-        mpfjax.monte_carlo(keys, filter, mpfjax.Series.skipping(far))
-    assert [each.filename for each in found] == [__file__]  # the line that ran it
-
-
-@pytest.mark.exactness
-def test_a_run_in_which_one_particle_has_all_weight_says_so_once(recwarn):
-    """As where the observations are in other units than the model."""
-    keys, seen = jax.random.split(jax.random.key(0), 3), np.array([0.4, np.nan, 0.9, 0.1])
-    filter = mpfjax.particle_filter(Drift(), 20)
-    run = mpfjax.run_filter(keys[0], filter, seen, missing="skip")
-    sizes = jax.vmap(lambda mixture: mixture.effective_sample_size)(run.collected)
-    np.testing.assert_allclose(run.effective_sample_size, sizes, rtol=1e-5)
-    few = mpfjax.particle_filter(Drift(), 4)
-    mpfjax.run_filter(keys[0], few, 1000 * seen, missing="skip")
-    assert not recwarn.list
-    said = "one particle had nearly all weight in nearly all steps with an observation"
-    with pytest.warns(RuntimeWarning, match=f"{said}: .*units"):
-        mpfjax.run_filter(keys[0], filter, 1000 * seen, missing="skip")
-    with pytest.warns(RuntimeWarning, match=f"{said} in 3 of 3 runs"):
-        mpfjax.monte_carlo(keys, filter, mpfjax.Series.skipping(1000 * seen))

@@ -1,0 +1,1 @@
+"""A model tried out before it is run."""
