@@ -11,7 +11,7 @@ A command is a function of keyword arguments, each with a type and a default:
 
 `python -m benchmarks.NAME` then takes --seeds and --out, with these lines as help and the module's
 docstring as description. --quick is an option of every command: it sets those given to `command`,
-which finish in seconds and show that the command runs.
+which finish in seconds and show that the command runs, and writes to a folder of its own.
 """
 
 import argparse
@@ -35,8 +35,9 @@ from tqdm import tqdm
 
 import mpfjax
 from mpfjax import console
-from mpfjax.console import exit_status, format_table, write_json
+from mpfjax.console import exit_status, write_json
 from mpfjax.files import write_whole
+from mpfjax.running.results import format_table
 
 ROOT = Path(__file__).resolve().parents[1]
 Z_95 = 1.959963984540054
@@ -73,7 +74,10 @@ def command(**quick: Any) -> Callable[[Callable[..., Any]], Callable[..., int]]:
         def main(arguments: Sequence[str] | None = None) -> int:
             parser = _parser(function)
             if parser.parse_args(arguments).quick:
-                parser.set_defaults(**quick)
+                # Files of a full run stay.
+                folder = parser.get_default("out")
+                elsewhere = {"out": folder.with_name(f"{folder.name}-quick")} if folder else {}
+                parser.set_defaults(**elsewhere | quick)
             values = vars(parser.parse_args(arguments))
             options = {name: values[name] for name in inspect.signature(function).parameters}
             results: list[Any] = []

@@ -43,9 +43,8 @@ from mpfjax.models.multi_object import MultiObjectModel as MultiObjectModel
 from mpfjax.models.multi_object import PairwiseRepulsion as PairwiseRepulsion
 from mpfjax.models.observations import Series as Series
 from mpfjax.models.quadratic import QuadraticModel as QuadraticModel
+from mpfjax.models.simulation import simulate as simulate
 from mpfjax.models.targets import TargetsModel as TargetsModel
-from mpfjax.models.trial import check_model as check_model
-from mpfjax.models.trial import simulate as simulate
 from mpfjax.moves.base import AbstractMarkovMove as AbstractMarkovMove
 from mpfjax.moves.base import AbstractMove as AbstractMove
 from mpfjax.moves.base import AbstractPropagation as AbstractPropagation
@@ -89,15 +88,18 @@ from mpfjax.running.islands import run_islands as run_islands
 from mpfjax.running.late import Replay as Replay
 from mpfjax.running.long_runs import Checkpoint as Checkpoint
 from mpfjax.running.programs import enable_compilation_cache as enable_compilation_cache
+from mpfjax.running.results import ComponentTable as ComponentTable
+from mpfjax.running.results import FilterRun as FilterRun
+from mpfjax.running.results import component_table as component_table
 from mpfjax.running.run import monte_carlo as monte_carlo
 from mpfjax.running.run import run_filter as run_filter
-from mpfjax.running.scan import FilterRun as FilterRun
 from mpfjax.running.storage import load_checkpoint as load_checkpoint
 from mpfjax.running.storage import save_checkpoint as save_checkpoint
 from mpfjax.running.studies import Study as Study
 from mpfjax.running.studies import read_study as read_study
 from mpfjax.running.studies import run_study as run_study
 from mpfjax.smoothing.forecasts import forecast as forecast
+from mpfjax.smoothing.forecasts import one_step_predictions as one_step_predictions
 from mpfjax.smoothing.variance import with_eve_indices as with_eve_indices
 from mpfjax.transforms import map_moves as map_moves
 from mpfjax.transforms import with_alarm as with_alarm
@@ -109,5 +111,6 @@ from mpfjax.transforms import with_quasi_monte_carlo as with_quasi_monte_carlo
 from mpfjax.transforms import with_resampling as with_resampling
 from mpfjax.transforms import with_restarts as with_restarts
 from mpfjax.transforms import with_score_gradient as with_score_gradient
+from mpfjax.trial.checking import check_model as check_model
 
 __version__: str

@@ -34,6 +34,7 @@ import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
+import wadler_lindig as wl
 from jax.core import Tracer
 
 P = ParamSpec("P")
@@ -563,3 +564,12 @@ def shown(value: Any) -> str:
     is_short = is_array and value.size < 10 and not is_key(value)
     text = " ".join((str(value) if is_short else eqx.tree_pformat(value, width=_MOST)).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
+
+
+def formatted(value: Any) -> str:
+    """The value on several lines, with fields at their defaults; short arrays as numbers."""
+
+    def number(leaf: Any) -> wl.AbstractDoc | None:
+        return wl.TextDoc(shown(leaf)) if isinstance(leaf, jax.Array) else None
+
+    return wl.pformat(value, hide_defaults=False, custom=number)

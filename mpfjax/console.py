@@ -34,18 +34,6 @@ def _read_by(
     return read
 
 
-def format_table(header: list[str], rows: list[list[str]]) -> str:
-    """A table in plain text, columns aligned to the right but for the first."""
-    widths = [max(len(line[i]) for line in [header, *rows]) for i in range(len(header))]
-
-    def format_line(cells: list[str]) -> str:
-        first, *rest = zip(cells, widths, strict=True)
-        return "  ".join([first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in rest)])
-
-    rule = "  ".join("-" * width for width in widths)
-    return "\n".join([format_line(header), rule, *map(format_line, rows)])
-
-
 def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str], int]:
     """The type of an option that is a whole number in this range, by default a count."""
     what = f"a whole number from {least} to {most}"

@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, checked, kinds, shown
+from mpfjax.checks import Count, checked, formatted, kinds, shown
 from mpfjax.memory import after_step
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, with_inputs
@@ -114,6 +114,9 @@ class Filter(eqx.Module):
     def weighs_initially(self) -> bool:
         """Whether an initial move changes the weights of x_0, by y_1 or otherwise."""
         return any(move.weighs for move in self.initial_moves)
+
+    def __repr__(self) -> str:
+        return formatted(self)
 
     def replace(self, **changes: Any) -> "Filter":
         """The filter with other arguments, which are checked again."""

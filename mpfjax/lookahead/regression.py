@@ -16,7 +16,7 @@ from mpfjax.models.base import with_inputs
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.law import law_of
 from mpfjax.models.observations import Series
-from mpfjax.running.scan import FilterRun
+from mpfjax.running.results import FilterRun
 
 # The effective number of particles for each coefficient of a regression.
 _PARTICLES_A_COEFFICIENT = 4

@@ -28,7 +28,8 @@ from mpfjax.operations.islands import (
 )
 from mpfjax.operations.logarithms import softmax
 from mpfjax.running.devices import choose_devices, over_devices
-from mpfjax.running.scan import FilterRun, scan, sound
+from mpfjax.running.results import FilterRun
+from mpfjax.running.scan import scan, sound
 
 
 @checked

@@ -14,7 +14,8 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import as_series, series_of
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import num_processors, over_devices, over_threads
-from mpfjax.running.scan import FilterRun, first_mixture, initial_keys, scan, sound, warn_of_start
+from mpfjax.running.results import FilterRun
+from mpfjax.running.scan import first_mixture, initial_keys, scan, sound, warn_of_start
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
 # have a row of particles each, which counts as so many times the particles.

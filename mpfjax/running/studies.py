@@ -21,8 +21,8 @@ from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import as_series, check_series
 from mpfjax.operations.logarithms import default_float
+from mpfjax.running.results import FilterRun
 from mpfjax.running.run import monte_carlo
-from mpfjax.running.scan import FilterRun
 from mpfjax.running.storage import (
     describe_parts,
     differences,

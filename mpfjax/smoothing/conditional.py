@@ -16,7 +16,8 @@ from mpfjax.models.observations import Series, as_arrays, as_series, refuse_wher
 from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.random import split, uniform
-from mpfjax.running.scan import FilterRun, initial_keys, scan, sound
+from mpfjax.running.results import FilterRun
+from mpfjax.running.scan import initial_keys, scan, sound
 from mpfjax.smoothing.backward import draw, log_transitions
 from mpfjax.smoothing.history import ancestors_of, mixtures_of, paths_through
 from mpfjax.smoothing.trajectories import draw_trajectories

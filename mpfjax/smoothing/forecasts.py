@@ -1,9 +1,8 @@
 """Forecasts: the mixture several steps ahead, with its components, and simulated observations."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count, check_one_each, checked
@@ -12,6 +11,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import with_inputs
 from mpfjax.models.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_with_floats_traced
+from mpfjax.running.results import FilterRun
 
 
 class Forecast(eqx.Module):
@@ -61,21 +61,55 @@ def forecast(
     return _forecast(key, filter, mixture, inputs, num_steps)
 
 
+@checked
+def one_step_predictions(
+    key: Key[Array, ""], filter: Filter, run: FilterRun, *, inputs: PyTree = None
+) -> Forecast:
+    """The distributions of x_t and y_t given y_1..y_{t-1}, for every step t of a run.
+
+    - `run`: of this filter, with its mixtures, as `run_filter(..., collect=None)` returns.
+    - `inputs`: u_1, ..., u_t, as the run had them.
+
+    The fields of the `Forecast` have a leading axis t: `observations` are draws of y_t before it
+    was observed, if the model has `sample_observation`, and count by the weights of `mixtures`.
+    Raises `ValueError` for a run without its mixtures, and as `forecast` does. Use it to compare
+    models by their predictions with proper scores (`metrics.crps`), and to check intervals.
+    """
+    if not isinstance(run.collected, ParticleMixture) or run.collected.log_weights.ndim != 2:
+        raise ValueError("run: it has not the mixtures of one run; collect them by collect=None")
+    before = jax.tree.map(
+        lambda first, later: jnp.concatenate([first[None], later[:-1]]), run.initial, run.collected
+    )
+    inputs = steps_of_inputs(inputs, len(run.degenerate), filter.model, "run")
+    return _predictions(key, filter, before, inputs)
+
+
 @jit_with_floats_traced
 def _forecast(key, filter, mixture, inputs, num_steps):
     def advance(
         mixture: ParticleMixture, step: tuple[Array, PyTree]
-    ) -> tuple[ParticleMixture, Any]:
-        key, now = step
-        key_step, key_observation = jax.random.split(key)
-        mixture, _ = filter._step(key_step, mixture, inputs=now)
-        model, observations = with_inputs(filter.model, now), None
-        simulate = getattr(model, "sample_observation", None)
-        if callable(simulate):
-            observations = simulate(key_observation, mixture.particles)
-            check_one_each(mixture.num_particles, sample_observation=observations)
-        return mixture, (mixture, observations)
+    ) -> tuple[ParticleMixture, Forecast]:
+        ahead = _one_ahead(filter, step[0], mixture, step[1])
+        return ahead.mixtures, ahead
 
     steps = (jax.random.split(key, num_steps), inputs)
-    _, (mixtures, observations) = jax.lax.scan(advance, mixture, steps)
-    return Forecast(mixtures, observations)
+    return jax.lax.scan(advance, mixture, steps)[1]
+
+
+@jit_with_floats_traced
+def _predictions(key, filter, mixtures, inputs):
+    keys = jax.random.split(key, mixtures.log_weights.shape[0])
+    return jax.lax.map(lambda step: _one_ahead(filter, *step), (keys, mixtures, inputs))
+
+
+def _one_ahead(
+    filter: Filter, key: Key[Array, ""], mixture: ParticleMixture, inputs: PyTree
+) -> Forecast:
+    key_step, key_observation = jax.random.split(key)
+    mixture, _ = filter._step(key_step, mixture, inputs=inputs)
+    model, observations = with_inputs(filter.model, inputs), None
+    simulate = getattr(model, "sample_observation", None)
+    if callable(simulate):
+        observations = simulate(key_observation, mixture.particles)
+        check_one_each(mixture.num_particles, sample_observation=observations)
+    return Forecast(mixture, observations)

@@ -10,7 +10,7 @@ from mpfjax.memory import check_past
 from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.observations import refuse_where
 from mpfjax.operations.stored import count_places, take
-from mpfjax.running.scan import FilterRun
+from mpfjax.running.results import FilterRun
 
 NO_PAST = "a state that began anew steps before, as with restarts, has no past among the particles"
 

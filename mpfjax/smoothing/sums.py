@@ -22,7 +22,8 @@ from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.logarithms import as_inexact
 from mpfjax.operations.random import split
 from mpfjax.report import StepInfo
-from mpfjax.running.scan import FilterRun, first_mixture, report_of, run_of, sound, step_or_predict
+from mpfjax.running.results import FilterRun
+from mpfjax.running.scan import first_mixture, report_of, run_of, sound, step_or_predict
 from mpfjax.smoothing.backward import (
     NO_TRANSITION,
     draw,

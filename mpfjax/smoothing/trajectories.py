@@ -24,7 +24,7 @@ from mpfjax.models.observations import (
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
-from mpfjax.running.scan import FilterRun
+from mpfjax.running.results import FilterRun
 from mpfjax.smoothing.backward import (
     append_last,
     check_pasts,

@@ -19,7 +19,7 @@ from mpfjax.moves.eve_indices import (
     mass_variances,
 )
 from mpfjax.operations.logarithms import log_sum_exp
-from mpfjax.running.scan import FilterRun
+from mpfjax.running.results import FilterRun
 
 # Standard errors from fewer runs are not reliable.
 FEWEST_RUNS = 4

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpfjax.checks import shown
-from mpfjax.console import format_table
+from mpfjax.running.results import format_table
 from mpfjax.tuning.sequential import SequentialPosterior
 
 Runs = SequentialPosterior | Sequence[SequentialPosterior | float] | np.ndarray

@@ -13,7 +13,8 @@ from mpfjax.checks import Rule, kinds, warn
 from mpfjax.filter import Filter
 from mpfjax.models.observations import Series, as_series, series_of
 from mpfjax.moves.base import AbstractProposal, all_of
-from mpfjax.running.scan import FilterRun, scan
+from mpfjax.running.results import FilterRun
+from mpfjax.running.scan import scan
 from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, placed, pose
 
 UnbiasedFilter = Annotated[

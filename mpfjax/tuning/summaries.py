@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.console import format_table
+from mpfjax.running.results import format_table
 
 Row = dict[str, float]
 _QUANTILES = (0.05, 0.5, 0.95)

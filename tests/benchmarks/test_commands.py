@@ -84,6 +84,7 @@ def example(
 def test_options_are_those_of_the_signature(capsys):
     assert example([]) == 30
     assert example(["--quick"]) == 2
+    assert capsys.readouterr().out.endswith("results-quick\n")  # files of a full run stay
     assert example(["--quick", "--sizes", "3", "4"]) == 7
     given = ["here", "--pair", "0", "1", "--kinds", "--no-weigh", "--out", "there", "--box", "1"]
     assert example(given) == 30

@@ -9,8 +9,8 @@ PACKAGE = Path(__file__).resolve().parents[2] / "mpfjax"
 # From the ground up: each part may import from those above it here, and from itself.
 ORDER = """
     files extras checks arrays operations memory mixture models moves report filter running
-    lookahead transforms filters smoothing console exact metrics vision robots tuning plotting
-    command __main__
+    lookahead transforms filters trial smoothing console exact metrics vision robots tuning
+    plotting command __main__
 """
 # Inside the folders that hold several floors: files, and folders.
 FLOORS = {
@@ -24,7 +24,7 @@ FLOORS = {
     "vision": "files colour tracking boxes",
     "lookahead": "quadratics pilot twisted regression learned",
     "robots": "maps motion sensors localisation pose",
-    "running": "storage programs long_runs devices scan run late islands studies",
+    "running": "storage programs long_runs devices results scan run late islands studies",
 }
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

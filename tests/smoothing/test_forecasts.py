@@ -88,3 +88,24 @@ def test_intervals_are_the_kalman_filters():
         np.testing.assert_allclose(shares, [[0.05, 0.95]] * NUM_STEPS, atol=4 * error)
     # Without the weights it is another.
     assert jnp.quantile(states[0], 0.05) < found[0, 0, 0] - 0.3
+
+
+@pytest.mark.exactness
+def test_predictions_of_each_step_are_the_kalman_filters():
+    """Of states and observations before each observation, in a run with weights far from equal."""
+    filter = mpfjax.particle_filter(LINEAR, 20_000)
+    run = mpfjax.run_filter(jax.random.key(1), filter, SEEN)
+    ahead = mpfjax.one_step_predictions(jax.random.key(2), filter, run)
+    exact = kalman_filter(LINEAR, SEEN)
+    before = jnp.concatenate([jnp.array([0.5]), exact.means[:-1, 0]])
+    spread = 0.81 * jnp.concatenate([jnp.ones(1), exact.covariances[:-1, 0, 0]]) + 0.3
+    means = jax.vmap(lambda mixture, y: (mixture.mean()[0], mixture.average(y)[0]))
+    for found, noise in zip(means(ahead.mixtures, ahead.observations), (0.0, 0.4), strict=True):
+        error = np.sqrt((spread + noise) / run.effective_sample_size.min())
+        assert np.all(np.abs(found - 0.9 * before) < 4 * error)
+    with pytest.raises(ValueError, match="run: it has not the mixtures of one run"):
+        mpfjax.one_step_predictions(
+            jax.random.key(2),
+            filter,
+            mpfjax.run_filter(jax.random.key(1), filter, SEEN, lambda mixture: None),
+        )

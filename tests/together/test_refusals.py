@@ -235,6 +235,7 @@ def test_every_public_call_is_tried():
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
         "NetworkProposal", "enable_compilation_cache", "check_model", "simulate", "map_moves",
         "TargetEstimates", "estimate_targets", "track_table", "number_distribution",
+        "ComponentTable", "component_table", "one_step_predictions",
     }  # fmt: skip
 
 
