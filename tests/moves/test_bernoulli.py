@@ -374,9 +374,11 @@ def test_objects_without_room_are_told_and_the_table_has_the_rest():
         KEY, mpfjax.bernoulli_filter(crowd, 900, 2), scans, collect=mpfjax.estimate_targets
     )
     with pytest.warns(RuntimeWarning, match="there was no room at step 1"):
-        table = mpfjax.track_table(run.collected)
+        table = mpfjax.track_table(run)
     assert set(table) == {"step", "label", "existence", "mean_0", "deviation_0"}
     assert len(table["step"]) == 6
+    with pytest.raises(ValueError, match=r"run: it collected f32\[3\]"):
+        mpfjax.track_table(run.log_likelihood_increments)
     assert len(set(zip(table["step"], table["label"], strict=True))) == 6
     # The others still count.
     np.testing.assert_allclose(run.collected.expected_number[-1], 3, atol=0.7)

@@ -1,14 +1,14 @@
 """Summaries of a filter of an unknown number of objects: tracks, and the number of objects."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from mpfjax.checks import checked, warn
+from mpfjax.checks import shown, warn
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.moves.objects.bernoulli import TARGETS
 
@@ -89,17 +89,21 @@ def number_distribution(existence: Float[Array, " m"]) -> Float[Array, " n"]:
     return jax.lax.scan(with_one_more, none, existence)[0]
 
 
-@checked
-def track_table(run: TargetEstimates) -> dict[str, np.ndarray]:
-    """The tracks of a run as columns: `pandas.DataFrame(track_table(run.collected))`.
+def track_table(run: Any) -> dict[str, np.ndarray]:
+    """The tracks of a run as columns: `pandas.DataFrame(track_table(run))`.
 
-    - `run`: the result of `run_filter(..., collect=estimate_targets)`, with a leading axis of
-      steps.
+    - `run`: the `FilterRun` of a `bernoulli_filter` that collected its mixtures or
+      `estimate_targets`, or what it collected, with a leading axis of steps.
 
     A track has a row for each step in which its object exists with a probability of at least one
     half. The columns are `step`, from 1 on, `label`, `existence`, and `mean_k` and `deviation_k` of
-    each component of the state. Warns if objects were crowded out, with the first such step.
+    each component of the state. Warns if objects were crowded out, with the first such step. Raises
+    `ValueError` for a run that collected anything else.
     """
+    run = getattr(run, "collected", run)
+    run = jax.vmap(estimate_targets)(run) if isinstance(run, ParticleMixture) else run
+    if not isinstance(run, TargetEstimates):
+        raise ValueError(f"run: it collected {shown(run)}; use collect=mpfjax.estimate_targets")
     lost = np.asarray(run.crowded_out)
     if len(steps := np.flatnonzero(lost >= _LEAST_EXISTENCE)):
         at = f"at step {steps[0] + 1} for {lost[steps[0]]:.1f} objects"
