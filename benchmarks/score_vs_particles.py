@@ -42,8 +42,8 @@ COLUMNS = {
     "N": "{particles}",
     "score": lambda entry: f"{np.mean(entry['scores']):.3f} ± {np.std(entry['scores']):.3f}",
     "runs with score 1": lambda entry: f"{np.mean(np.array(entry['scores']) == 1):.3f}",
-    "weight of one": "{weight_mean:.2f} ± {weight_std:.2f}",
-    "mode mass error": "{mode_mass_error:.3f}",
+    "mixture weight": "{weight_mean:.2f} ± {weight_std:.2f}",
+    "probability error": "{mode_mass_error:.3f}",
 }
 OF_PARTICLES = ("positions", "occupied", "component_indicators")
 

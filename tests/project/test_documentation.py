@@ -1,7 +1,6 @@
 """The documentation holds: its code runs, its commands exist, the API pages are complete."""
 
 import importlib.util
-import inspect
 import json
 import re
 from pathlib import Path
@@ -11,7 +10,6 @@ import pytest
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser, SkipParser
 
-import mpfjax
 from tests.marking import marked, weekly
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -148,10 +146,3 @@ def test_every_public_name_is_on_an_api_page(monkeypatch):
     assert len(shown) == len(set(shown)), "a name stands on two pages"
     # Pages also show what functions return, under the names of their files.
     assert set(names.values()) <= {names.get(name, name) for name in shown}
-
-
-def test_the_step_that_is_shown_is_the_one_that_runs():
-    shown = re.search(r"^def _step\(.*?^```", TEXTS[README], re.M | re.S)
-    lines = inspect.getsource(mpfjax.Filter._step).splitlines()
-    body = lines[next(k for k, line in enumerate(lines) if line.endswith('predicts."""')) + 1 :]
-    assert [line.strip() for line in shown[0].splitlines()[1:-1]] == [line.strip() for line in body]
