@@ -69,7 +69,7 @@ class Filter(eqx.Module):
     num_particles: int = eqx.field(static=True)
     num_components: int = eqx.field(static=True)
     initial_noise: Noise = eqx.field(static=True)
-    _keeps_parents: bool = eqx.field(static=True, init=False)
+    _keeps_parents: bool = eqx.field(static=True, init=False, repr=False)
 
     @checked
     def __init__(
