@@ -99,7 +99,7 @@ def test_predictions_of_each_step_are_the_kalman_filters():
     exact = kalman_filter(LINEAR, SEEN)
     before = jnp.concatenate([jnp.array([0.5]), exact.means[:-1, 0]])
     spread = 0.81 * jnp.concatenate([jnp.ones(1), exact.covariances[:-1, 0, 0]]) + 0.3
-    means = jax.vmap(lambda mixture, y: (mixture.mean()[0], mixture.average(y)[0]))
+    means = jax.vmap(lambda mixture, y: (mixture.mean()[0], mixture.expectation(y)[0]))
     for found, noise in zip(means(ahead.mixtures, ahead.observations), (0.0, 0.4), strict=True):
         error = np.sqrt((spread + noise) / run.effective_sample_size.min())
         assert np.all(np.abs(found - 0.9 * before) < 4 * error)
