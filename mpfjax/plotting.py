@@ -14,8 +14,7 @@ from matplotlib.patches import Ellipse
 from mpfjax.checks import CountOrZero, checked, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.running.results import FilterRun
-from mpfjax.tuning.optimisation import TuningRun
-from mpfjax.tuning.summaries import numbers_of
+from mpfjax.tuning import optimisation, summaries
 
 # Okabe and Ito's palette (2008), which people with colour blindness can tell apart.
 COLOURS = (
@@ -150,11 +149,11 @@ def draw_paths(
 
 
 @checked
-def draw_tuning(run: TuningRun, *, ax: Axes | None = None) -> Axes:
+def draw_tuning(run: optimisation.TuningRun, *, ax: Axes | None = None) -> Axes:
     """The parameters of `tuning.fit` or `maximise` over its steps, each number a line."""
     ax = _axes(ax, "step of the optimiser", "parameters")
     history = {name: np.asarray(run.history[name]) for name in run.parameters}
-    for k, (name, line) in enumerate(numbers_of(history, 1).items()):
+    for k, (name, line) in enumerate(summaries.numbers_of(history, 1).items()):
         ax.plot(line, color=COLOURS[k % len(COLOURS)], label=name)
     return _with_truth(ax, None)
 

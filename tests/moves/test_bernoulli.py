@@ -377,7 +377,7 @@ def test_objects_without_room_are_told_and_the_table_has_the_rest():
         table = mpfjax.track_table(run)
     assert set(table) == {"step", "label", "existence", "mean_0", "deviation_0"}
     assert len(table["step"]) == 6
-    with pytest.raises(ValueError, match="run: it collected .*estimate_targets"):
+    with pytest.raises(ValueError, match=r"run: it collected .*estimate_targets"):
         mpfjax.track_table(run.log_likelihood_increments)
     assert len(set(zip(table["step"], table["label"], strict=True))) == 6
     # The others still count.
