@@ -9,7 +9,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -56,8 +56,8 @@ def jit_with(
     options: dict[str, int | str], function: Callable[..., PyTree]
 ) -> Callable[..., PyTree]:
     """`equinox.filter_jit` with options of the compiler."""
-    with_options: Any = eqx.filter_jit  # whose type does not have them
-    return with_options(function, compiler_options=options)
+    # Its type does not have them.
+    return cast(Any, eqx.filter_jit)(function, compiler_options=options)
 
 
 def jit_on_wide_vectors(
@@ -82,7 +82,7 @@ def jit_on_wide_vectors(
             with one_at_a_time:  # or several threads would each compile the program
                 compiled = wide()
             try:
-                with _watched(function):
+                with _sign_of_life(function):
                     return compiled(*arguments, **named)
             except ValueError as error:
                 # All arguments are constants of the caller's program, or a function among them
@@ -118,7 +118,7 @@ def _older_emitters() -> dict[str, int | str]:
 
 
 @contextlib.contextmanager
-def _watched(function: Callable[..., PyTree]) -> Iterator[None]:
+def _sign_of_life(function: Callable[..., PyTree]) -> Iterator[None]:
     """Within it, a line is logged if the function is still being compiled after some seconds.
 
     One thread watches all calls, since a thread for each would take longer than a short step.
@@ -140,21 +140,21 @@ def _watched(function: Callable[..., PyTree]) -> Iterator[None]:
 
 def _watch() -> None:
     """Log a line for each call whose thread is in JAX's compiler after some seconds."""
-    told: set[float] = set()
+    reported: set[float] = set()
     while _has_calls.wait():
         time.sleep(PATIENCE / 4)
         if not _calls:
             _has_calls.clear()
-            told.clear()
+            reported.clear()
             if _calls:  # one that came in between
                 _has_calls.set()
         for caller, (start, function) in list(_calls.items()):
             frame = sys._current_frames().get(caller)
-            if start in told or time.monotonic() - start < PATIENCE or frame is None:
+            if start in reported or time.monotonic() - start < PATIENCE or frame is None:
                 continue
             modules = {at.f_globals.get("__name__") for at, _ in traceback.walk_stack(frame)}
             if modules & _COMPILERS:
-                told.add(start)
+                reported.add(start)
                 _logger.warning(_WAITING, f"{function.__module__}.{function.__qualname__}")
 
 

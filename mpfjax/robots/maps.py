@@ -163,7 +163,8 @@ class OccupancyGrid(Fitting):
         return replace_fields(self, table=jnp.where(ranges < farthest, ranges, jnp.inf))
 
     def _look_up(self, poses: Poses, angles: Angles, max_range: float) -> Beams:
-        table: Any = self.table
+        table = self.table
+        assert table is not None
         rows, columns, _ = self.cells(poses[:, None, :2])
         turn = 2 * np.pi / table.shape[2]
         nearest = jnp.round((poses[:, 2:] + angles[None]) / turn)

@@ -2,12 +2,11 @@
 
 import os
 from pathlib import Path
-from typing import Any
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-_settings: Any = jax.config  # whose attributes no type checker knows
+_FOLDER = "jax_compilation_cache_dir"
 
 
 def enable_compilation_cache(folder: str | Path | None = None) -> Path:
@@ -26,14 +25,14 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path:
     """
     if folder is None:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        setting: str | None = _settings.jax_compilation_cache_dir
+        setting: str | None = getattr(jax.config, _FOLDER)
         folder = setting or caches / "mpfjax"
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    if str(path) != _settings.jax_compilation_cache_dir:
-        jax.config.update("jax_compilation_cache_dir", str(path))
+    if str(path) != getattr(jax.config, _FOLDER):
+        jax.config.update(_FOLDER, str(path))
         # An earlier compilation may have decided that there is no cache.
         compilation_cache.reset_cache()
     return path

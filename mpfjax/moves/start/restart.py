@@ -68,8 +68,8 @@ class RecentSteps(Memory):
     def check_past(self) -> None:
         """Raise a `ValueError` if the state is drawn anew at a step of every run."""
         if self.start:
-            said = f"with_initialisation draws the state anew at step {self.start}"
-            raise ValueError(f"filter: {said}, so that a run cannot be smoothed")
+            reason = f"with_initialisation draws the state anew at step {self.start}"
+            raise ValueError(f"filter: {reason}, so that a run cannot be smoothed")
 
     def warning(self) -> str:
         """Where the powers of a likelihood ran out."""

@@ -1,7 +1,6 @@
 """Rival hypotheses about objects, with colours that are learned."""
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -55,7 +54,8 @@ class LearnedColourModel(ColourModel):
         some = jnp.any(shown > 0, axis=(1, 2, 3)) & jnp.all(jnp.isfinite(shown), axis=(1, 2, 3))
         share = jnp.where(some, rate * jax.nn.sigmoid(log_seen - log_hidden), 0.0)
         share = share.astype(shown.dtype)[:, None, None, None]
-        past: Any = states.appearance
+        past = states.appearance
+        assert past is not None
         change = jnp.where(share > 0, shown, past) - past
         return dataclasses.replace(states, appearance=past + share * change)
 
@@ -66,7 +66,8 @@ class LearnedColourModel(ColourModel):
         counts, sides = self.counts(observation, states)
         weights, references = self.references_of(states)
         to_first = self.distances(counts, sides, weights, references)
-        appearance: Any = states.appearance
+        appearance = states.appearance
+        assert appearance is not None
         to_learned = self.distances(counts, sides, weights, appearance)
         distances = self.anchor * to_first + (1 - self.anchor) * to_learned
         log_hidden = -0.5 * self.hidden_distance / self.sigma**2
