@@ -105,8 +105,8 @@ _KEPT = (
 _NEARLY_ALL, _FEWEST_TOLD = 0.9, 8
 # A run is lost if so many of the last steps have fewer than two effective particles; or if their
 # increments are lower than the highest ones by this many nats, and this many times the spread of
-# these, at an effective sample size below this share of N. On fifteen models, leaving one out at a
-# time, the good runs stay below 2 nats.
+# these, at an effective sample size below this share of N. Chosen on fifteen models, about 25 rules
+# tried: 1 of 3 399 good runs is reported, and 563 of 1 745 lost ones.
 _LAST, _LAST_ALONE, _LEAST_FALL, _FALLS, _LARGE = 10, 8, 20.0, 10.0, 0.6
 _MOST_LOOKED_AT = 16  # runs, for what is told of their start
 Report = dict[str, PyTree]
