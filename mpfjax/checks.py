@@ -566,7 +566,7 @@ def shown(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
 
 
-def formatted(value: Any) -> str:
+def format_fields(value: Any) -> str:
     """The value on several lines, with fields at their defaults; short arrays as numbers."""
 
     def number(leaf: Any) -> wl.AbstractDoc | None:

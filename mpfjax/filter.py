@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, checked, formatted, kinds, shown
+from mpfjax.checks import Count, checked, format_fields, kinds, shown
 from mpfjax.memory import after_step
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, with_inputs
@@ -116,7 +116,7 @@ class Filter(eqx.Module):
         return any(move.weighs for move in self.initial_moves)
 
     def __repr__(self) -> str:
-        return formatted(self)
+        return format_fields(self)
 
     def replace(self, **changes: Any) -> "Filter":
         """The filter with other arguments, which are checked again."""

@@ -42,12 +42,12 @@ def _jit(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """A compiled function that runs once or twice: most of the time would go into compiling."""
 
     @functools.cache
-    def compiled() -> Callable[..., PyTree]:
+    def program() -> Callable[..., PyTree]:
         options = in_little_memory(soon=True)
         least = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
         return jit_with(options | least if options else {}, function)
 
-    return lambda *arguments: compiled()(*arguments)
+    return lambda *arguments: program()(*arguments)
 
 
 @checked
@@ -131,13 +131,13 @@ def _draw(key, model, now):
     if callable(getattr(model, "log_initial", None)):
         drawn["x_0"], drawn["log_initial"] = draws, law_of(model).log_initial(draws)
     starts = _rows(initial, slice(_FAMILIES))
-    places = _repeated(_rows(starts, slice(_PLACES)), _DRAWS)
+    places = _repeat(_rows(starts, slice(_PLACES)), _DRAWS)
     drawn["many x_1"] = _of_many_keys(_move, keys[2], now, places)
     far = _rows(initial, slice(_FAMILIES * _SIBLINGS))
-    groups = [far, _repeated(starts, _SIBLINGS)]
+    groups = [far, _repeat(starts, _SIBLINGS)]
     has_density = is_mixed(model) or callable(getattr(model, "log_transition", None))
     if has_density:
-        groups.append(_repeated(_rows(starts, slice(_PLACES)), _DENSITY_DRAWS))
+        groups.append(_repeat(_rows(starts, slice(_PLACES)), _DENSITY_DRAWS))
     before = jax.tree.map(lambda *parts: jnp.concatenate(parts), *groups)
     after, number = _move(keys[3], now, before), _FAMILIES * _SIBLINGS
     drawn["x_1"] = _rows(after, slice(0, number, _SIBLINGS // _DRAWS))
@@ -152,12 +152,12 @@ def _draw(key, model, now):
         )
 
         def log_transition(draw: PyTree, states: PyTree) -> Float[Array, " s"]:
-            return law.log_transition(_repeated(_rows(draw, None), _SIBLINGS), states)
+            return law.log_transition(_repeat(_rows(draw, None), _SIBLINGS), states)
 
         drawn["origins of x_2"] = _log_densities(log_transition, _in_families(children), siblings)
     can_simulate = callable(getattr(model, "sample_observation", None))
     if can_simulate and law.is_whole and getattr(model, "interaction", None) is None:
-        same = _repeated(_rows(after, slice(_PLACES)), _DRAWS)
+        same = _repeat(_rows(after, slice(_PLACES)), _DRAWS)
         drawn["many y_1"] = _of_many_keys(_observe, keys[5], now, same)
         observations = _in_families(_observe(keys[5], now, _side_by_side(families)))
         drawn["families"] = families
@@ -190,7 +190,7 @@ def _rows(states: PyTree, which: Any) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[which], states)
 
 
-def _repeated(states: PyTree, number: int) -> PyTree:
+def _repeat(states: PyTree, number: int) -> PyTree:
     return jax.tree.map(lambda leaf: jnp.repeat(leaf, number, axis=0), states)
 
 
@@ -313,7 +313,7 @@ def _of_origins(
 def _of_proposal(key, now, proposal):
     """Draws of a proposal from each of a few x_0, and log q."""
     starts = _initial(jax.random.fold_in(key, 1), now.initial_model, _PLACES)
-    draws, logs = proposal.propose(key, now, _repeated(starts, _DENSITY_DRAWS))
+    draws, logs = proposal.propose(key, now, _repeat(starts, _DENSITY_DRAWS))
     return now.law.part(draws), logs
 
 
