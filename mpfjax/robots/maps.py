@@ -23,6 +23,7 @@ from mpfjax.checks import (
 )
 from mpfjax.extras import optional
 from mpfjax.models.base import replace_fields
+from mpfjax.operations.stored import stored
 
 Poses = Float[Array, "n 3"]
 Angles = Float[Array, " b"]
@@ -167,20 +168,23 @@ class OccupancyGrid(Fitting):
         assert table is not None
         rows, columns, _ = self.cells(poses[:, None, :2])
         turn = 2 * np.pi / table.shape[2]
-        nearest = jnp.round((poses[:, 2:] + angles[None]) / turn)
+        nearest = jnp.round((poses[:, 2:] + angles[None]) / turn).astype(jnp.int32)
+        nearest = nearest % table.shape[2]
+        ways = turn * jnp.arange(table.shape[2], dtype=poses.dtype)
+        cos, sin = (stored(way(ways))[nearest] for way in (jnp.cos, jnp.sin))
         x, y = (
             poses[:, None, k] - self.origin[k] - self.resolution * (cells.astype(poses.dtype) + 0.5)
             for k, cells in ((0, columns), (1, rows))
         )
-        ahead = jnp.cos(turn * nearest) * x + jnp.sin(turn * nearest) * y
-        ranges = table[rows, columns, nearest.astype(jnp.int32) % table.shape[2]] - ahead
+        ranges = table[rows, columns, nearest] - (cos * x + sin * y)
         return jnp.clip(ranges, 0.0, max_range)
 
 
 def ends_of(poses: Poses, angles: Angles, ranges: Float[Array, "#n b"]) -> Float[Array, "n b 2"]:
     """Where beams of these ranges end."""
-    cos, sin = jnp.cos(poses[:, 2:]), jnp.sin(poses[:, 2:])
-    ahead, across = ranges * jnp.cos(angles)[None], ranges * jnp.sin(angles)[None]
+    # Stored, since XLA would compute them again for every beam.
+    cos, sin = (stored(way(poses[:, 2]))[:, None] for way in (jnp.cos, jnp.sin))
+    ahead, across = (stored(ranges * way(angles)[None]) for way in (jnp.cos, jnp.sin))
     x, y = cos * ahead - sin * across, sin * ahead + cos * across
     return poses[:, None, :2] + jnp.stack([x, y], axis=-1)
 

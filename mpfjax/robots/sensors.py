@@ -26,6 +26,7 @@ from mpfjax.checks import (
     warn,
 )
 from mpfjax.models.gaussians import log_normal
+from mpfjax.operations.stored import stored
 from mpfjax.robots.maps import Angles, Beams, OccupancyGrid, Poses, ends_of
 
 Weight = Annotated[Float[Array, ""], NOT_NEGATIVE]
@@ -97,7 +98,8 @@ class AbstractLaser(Fitting):
         cos, sin = jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2])
         steps = [cos * forward - sin * left, sin * forward + cos * left, jnp.full_like(cos, turn)]
         ranges = jnp.where(met, scan, self.laser_max_range)
-        logs = self.log_beams(ranges, poses + jnp.stack(steps, axis=1), angles, grid)
+        mounted = stored(poses.T + jnp.stack(steps)).T
+        logs = self.log_beams(ranges, mounted, angles, grid)
         return self.log_scan(jnp.where(is_used[None], logs, -jnp.inf), is_used)
 
     def usable(self, scan: Float[Array, " k"], met: Bool[Array, " k"]) -> Bool[Array, " k"]:
@@ -158,7 +160,9 @@ class LikelihoodField(AbstractLaser):
     def log_beams(self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid) -> Beams:
         """By the distance of each beam's end to the nearest edge of a wall."""
         gaps = grid.at(ends_of(poses, angles, ranges[None]), grid.distances, jnp.inf)
-        hit = jnp.exp(log_normal(jnp.minimum(gaps, self.laser_likelihood_max_dist), self.sigma_hit))
+        # Stored, since XLA uses no vectors for what it fuses with a look-up.
+        gaps = stored(jnp.minimum(gaps, self.laser_likelihood_max_dist))
+        hit = jnp.exp(log_normal(gaps, self.sigma_hit))
         rest, total = self.z_rand / self.laser_max_range, self.z_hit + self.z_rand
         if self.weighting == "cubes":
             hit, total = hit * self.sigma_hit * np.sqrt(2 * np.pi), 1.0
@@ -191,7 +195,8 @@ class BeamModel(AbstractLaser):
 
     def log_beams(self, ranges: Angles, poses: Poses, angles: Angles, grid: OccupancyGrid) -> Beams:
         """By the range to the first occupied cell."""
-        most, expected = self.laser_max_range, grid.ranges(poses, angles, self.laser_max_range)
+        most = self.laser_max_range
+        expected = stored(grid.ranges(poses, angles, most))
         inside = ndtr((most - expected) / self.sigma_hit) - ndtr(-expected / self.sigma_hit)
         hit = jnp.exp(log_normal(ranges[None] - expected, self.sigma_hit)) / inside
         rate, wall = self.lambda_short, jnp.maximum(expected, grid.resolution / 2)
