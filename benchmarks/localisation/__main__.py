@@ -1,27 +1,31 @@
-"""A robot that is lost in a map, and one that is carried away: who finds the true pose.
+"""Global localisation and recovery: which filters find the robot, and know when they are lost.
 
-    python -m benchmarks.localisation                       # all scenes that are there
+    python -m benchmarks.localisation                       # all scenes whose data are present
     python -m benchmarks.localisation --scenes office ring --particles 1000
     python -m benchmarks.localisation --scenes twelve --steps 40 --particles 5000
 
-Scenes are the buildings and the map of the folder that MPFJAX_DATA names, or ../shared/data, where
-they are there (each file of logs/, and turtlebot), drawn offices of nine and of ten rooms that are
-equal until a pillar is seen at the end, one of twelve equal rooms without any, and a ring of 24
-doors. Each has four drives. A robot knows
-nothing of its pose at first; when a drive has ended it is carried away without notice, and goes on
-with the next one.
+The folder that MPFJAX_DATA names, or ../shared/data, has laser logs of buildings, and the map of
+TurtleBot3's world: `turtlebot`, the same with AMCL's sensor (`amcl`), and with boxes that are not
+on the map (`boxes`). Drawn scenes are offices of nine and of ten rooms that are equal until a
+pillar is visible at the end, one of twelve equal rooms, and a ring of 24 doors. Each scene has four
+drives. The pose is unknown at first; at the end of a drive the robot is carried to the start of the
+next drive without notice.
 
-A run is right where more than half of the distribution lies near the true pose: within .6 m, in a
-building 1 m, and .4 rad. `right` is the share of runs that are right at the end of the first drive,
-`found again` those at the end of the second, `steps` the median of the steps until a run is right
-after it was carried away, of those that ever are, and `sd of log Ẑ` that of the first drive,
-between runs of the same drive. `lost` is the probability that
-the filter itself has for not being right, and the area is that under its ROC curve over all scans
-from the eighth of a drive on; AMCL's own measure is 1 - w_fast / w_slow. Each of twelve equal rooms
-has a mass of 1/12 at all times: there are the errors of these masses at the end of the first drive,
-and 15 scans after the robot was carried away, and the share of rooms that are lost, with a mass
-below .001. All filters have
---particles, but AMCL, which has 2000 to 5000.
+A run is localised where more than half of the distribution is within .6 m (in a building 1 m) and
+.4 rad of the true pose. The columns of the table are
+
+- `20 scans`, `end`: the fraction of runs that are localised then, in the first drive;
+- `found again`: the fraction at the end of the second drive, and the median number of scans until
+  then;
+- `ROC`: the area under the ROC curve of the filter's own probability of not being localised, over
+  all scans from the eighth on; for AMCL of its measure 1 - w_fast / w_slow;
+- `in walls`: the largest probability, at any scan, of the robot in an occupied cell or off the map;
+- `ms`: CPU time per scan, the median over runs, with starts and restarts;
+- `sd of log Z`: of the first drive, between runs of the same drive.
+
+Each of twelve equal rooms has probability 1/12 at all times. Another table has the root mean
+squared error of these probabilities at the end of the first drive and 15 scans after the robot was
+carried away, and the fraction of rooms with a probability below .001.
 
 Into --out DIR go localisation.json and recovery.png.
 """
@@ -37,32 +41,41 @@ import numpy as np
 from benchmarks import figures as plotting
 from benchmarks import harness
 from benchmarks.harness import AtLeast2, Natural, Seed, command
-from benchmarks.localisation.filters import NAMES, milliseconds, run
+from benchmarks.localisation.filters import FILTERS, Runs, run
 from benchmarks.localisation.scenes import ROOMS, SCENES, Scene, Stretch, with_people
+from mpfjax import robots
 
-TABLES = {
-    "right at the end": "{right:.2f} ± {right_error:.2f}",
-    "right after 20 scans": "{early:.2f} ± {early_error:.2f}",
-    "area under the ROC curve of lost": "{lost_area:.3f}",
-    "ms per scan": "{milliseconds:.1f}",
-    "sd of log Ẑ": "{log_z_sd:.1f} ± {log_z_sd_error:.1f}",
-    "found again, after steps": "{found:.2f} ± {found_error:.2f}, {steps:.0f}",
-    "RMSE of equal masses, lost": "{masses_rmse:.3f}, {masses_lost:.2f}",
-    "the same 15 scans after": "{masses_after_rmse:.3f}, {masses_after_lost:.2f}",
+COLUMNS = {
+    "scene": "{scene}",
+    "filter": "{filter}",
+    "20 scans": "{early:.2f} ± {early_error:.2f}",
+    "end": "{right:.2f} ± {right_error:.2f}",
+    "found again": "{found:.2f} ± {found_error:.2f}, {steps:.0f}",
+    "ROC": "{lost_area:.3f}",
+    "in walls": "{in_walls:.3f}",
+    "ms": "{milliseconds:.1f}",
+    "sd of log Z": "{log_z_sd:.1f} ± {log_z_sd_error:.1f}",
+}
+OF_ROOMS = {
+    "filter": "{filter}",
+    "error at the end": "{masses_rmse:.3f}",
+    "below .001": "{masses_lost:.2f}",
+    "error after 15 scans": "{masses_after_rmse:.3f}",
+    "below .001 then": "{masses_after_lost:.2f}",
 }
 
 EARLY = 20  # scans, one per second
-SETTLED = 8  # scans of a drive, from which on a pose is asked for
+SETTLED = 8  # scans, from which on a pose is asked for
 LATER = 15  # scans after the robot was carried away, when masses are looked at
 
-QUICK = ["replacing 1%", "AMCL", "mixture, with_restarts"]
+QUICK = ["particle filter", "AMCL", "mixture, with_restarts"]
 
 
 @command(scenes=["ring"], filters=QUICK, seeds=2, particles=100, components=4, steps=5)
 def main(
     *,
     scenes: Sequence[Annotated[str, (*SCENES,)]] = (*SCENES,),
-    filters: Sequence[Annotated[str, (*NAMES,)]] = (*NAMES,),
+    filters: Sequence[Annotated[str, (*FILTERS,)]] = (*FILTERS,),
     particles: AtLeast2 = 2000,
     components: AtLeast2 = 16,
     seeds: AtLeast2 = 8,
@@ -83,22 +96,24 @@ def main(
     for name in scenes:
         scene = SCENES[name](seed, steps)
         scene = with_people(scene, people / 100, seed) if people else scene
-        drives = scene.drives
+        # After each drive the robot is carried to the start of the next one.
+        pairs = zip(scene.drives, scene.drives[1:] + scene.drives[:1], strict=True)
+        drives = [Stretch(*map(np.concatenate, zip(*pair, strict=True))) for pair in pairs]
         for filter in filters:
-            found = [
-                follow(name, scene, filter, pair, particles, components, seeds, 4 * seed + number)
-                for number, pair in enumerate(zip(drives, drives[1:] + drives[:1], strict=True))
+            keys = [
+                jax.random.split(jax.random.key(4 * seed + k), seeds) for k in range(len(drives))
             ]
-            row = {"scene": name, "filter": filter, **summary(found, len(drives[0].poses))}
-            series = series_of(drives[0])
-            timed = milliseconds(filter, scene.model, particles, components, series)
-            rows.append(row | ({} if timed is None else {"milliseconds": timed}))
+            data = zip(keys, map(series_of, drives), strict=True)
+            all_runs = run(filter, scene.model, particles, components, scene.near, data)
+            found = [found_of(name, scene, *each) for each in zip(drives, all_runs, strict=True)]
+            rows.append({"scene": name, "filter": filter, **summary(found, scene.carried)})
             harness.data(out / "localisation.json", settings=settings, rows=rows)
-            print(f"{name}, {filter}: {TABLES['right at the end'].format(**rows[-1])}")
+            print(f"{name}, {filter}: {COLUMNS['end'].format(**rows[-1])}")
         # Programs keep memory maps, of which a process has 65 530, and no other scene needs these.
         jax.clear_caches()
-    for title, cell in TABLES.items():
-        print(f"\n{harness.pivot(title, rows, '{filter}', '{scene}', cell)}")
+    print(f"\n{harness.table(COLUMNS, rows)}")
+    if of_rooms := [row for row in rows if "masses_rmse" in row]:
+        print(f"\n{harness.table(OF_ROOMS, of_rooms)}")
     harness.figures(out, recovery=picture(rows))
     print(f"written to {out}")
 
@@ -112,30 +127,30 @@ class Found(NamedTuple):
     """(runs, 2, rooms), of rooms without a pillar: at the end of the first drive, and later."""
     lost: np.ndarray | None
     """The filter's own measure at each step, (runs, t)."""
+    in_walls: float
+    """The most of the distribution that is in occupied cells or off the map at any step."""
+    milliseconds: np.ndarray
 
 
-def follow(
-    name: str, scene: Scene, filter: str, drives: tuple[Stretch, Stretch], size: int,
-    components: int, seeds: int, seed: int,
-) -> Found:  # fmt: skip
-    """Runs of a filter on a drive, after which the robot is carried to the start of another."""
-    both = Stretch(*map(np.concatenate, zip(*drives, strict=True)))
-    keys, poses = jax.random.split(jax.random.key(seed), seeds), jnp.asarray(both.poses, float)
-    arguments = size, components, keys, series_of(both), scene.near
-    trace, increments, lost = run(filter, scene.model, *arguments)
-    particles, logs = trace.particles, trace.log_weights
-    x, y, turn = jnp.moveaxis(particles - poses[None, :, None], -1, 0)
-    turned = jnp.abs((turn + jnp.pi) % (2 * jnp.pi) - jnp.pi)
-    near = (jnp.hypot(x, y) < scene.near) & (turned < 0.4)
-    right = jnp.sum(jnp.where(near, jnp.exp(logs), 0.0), axis=-1) > 0.5
-    log_z = jnp.sum(increments[:, : len(drives[0].poses)], axis=1)
+def found_of(name: str, scene: Scene, drive: Stretch, runs: Runs) -> Found:
+    """Of the runs on a drive and on the next one: where the particles are."""
+    poses, (particles, logs, *_) = drive.poses, runs.trace
+    x, y, turn = np.moveaxis(particles - poses[None, :, None].astype(particles.dtype), -1, 0)
+    turned = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
+    near = (np.hypot(x, y) < scene.near) & (turned < 0.4)
+    weights = np.exp(logs)
+    right = np.sum(weights, axis=-1, where=near) > 0.5
     rooms, masses = ROOMS.get(name), None
     if rooms and not rooms.pillar:
-        carried = len(drives[0].poses)
-        at = np.minimum([carried - 1, carried - 1 + LATER], len(poses) - 1)
-        states = np.asarray(particles[:, at])
-        masses = rooms.masses(states, np.exp(logs[:, at]))
-    return Found(np.asarray(right), np.asarray(log_z, float), masses, lost)
+        at = np.minimum([scene.carried - 1, scene.carried - 1 + LATER], len(poses) - 1)
+        masses = rooms.masses(particles[:, at], weights[:, at])
+    in_walls = 0.0
+    if isinstance(scene.model, robots.RobotModel):
+        grid = scene.model.grid
+        walls = np.asarray(grid.at(jnp.asarray(particles[..., :2]), grid.occupied, True))
+        in_walls = float(np.max(np.sum(weights, axis=-1, where=walls)))
+    log_z = np.sum(runs.increments[:, : scene.carried], axis=1)
+    return Found(right, log_z, masses, runs.lost, in_walls, runs.milliseconds)
 
 
 def series_of(drive: Stretch) -> tuple[Any, Any]:
@@ -163,18 +178,20 @@ def summary(found: list[Found], carried: int) -> dict[str, Any]:
     scored = [each for each in found if each.lost is not None]
     areas = {}
     if scored:
-        settled = np.arange(right.shape[1]) % carried >= min(SETTLED, carried - 1)
+        settled = np.arange(right.shape[1]) >= min(SETTLED, carried) - 1
         scores = np.concatenate([np.asarray(each.lost)[:, settled] for each in scored])
         is_lost = ~np.concatenate([each.right[:, settled] for each in scored])
         value = area(scores, is_lost)
         areas = {} if value is None else {"lost_area": value}
-    ever = after.any(axis=1)
+    ever, times = after.any(axis=1), np.concatenate([each.milliseconds for each in found])
     return {
         "runs": runs, "carried": carried, "by_step": by_step, "errors": errors,
         **areas, "early": by_step[early], "early_error": errors[early],
         "right": by_step[carried - 1], "right_error": errors[carried - 1],
         "found": by_step[-1], "found_error": errors[-1],
         "steps": float(np.median(1 + after[ever].argmax(axis=1))) if ever.any() else None,
+        "in_walls": max(each.in_walls for each in found),
+        "milliseconds": float(np.median(times[1:])),  # the first run compiles
         "log_z_sd": deviation, "log_z_sd_error": deviation / np.sqrt(2 * (runs - len(found))),
         **errors_of_masses([each.masses for each in found if each.masses is not None]),
     }  # fmt: skip

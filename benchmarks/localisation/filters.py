@@ -1,8 +1,7 @@
-"""What is compared: plain filters, AMCL, a peer, the mixture, and the mixture with restarts."""
+"""What is compared: the plain filter, AMCL, the mixture, and the mixture with restarts."""
 
-import importlib.util
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,11 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 import mpfjax
-from benchmarks.peers.libraries import blackjax_steps
 from mpfjax import robots
 from mpfjax.models.base import replace_fields
-
-PEER = "blackjax, bootstrap filter"
 
 
 class AdaptiveMonteCarlo(mpfjax.AbstractPropagation):
@@ -99,16 +95,6 @@ def as_amcl(model: Any) -> Any:
     return replace_fields(model, sensor=field)
 
 
-def replace_some(
-    key: Key[Array, ""], mixture: mpfjax.ParticleMixture, now: mpfjax.Step
-) -> mpfjax.ParticleMixture:
-    """One in a hundred particles is drawn from x_0's law."""
-    keys, size = jax.random.split(key), mixture.num_particles
-    is_new = jax.random.uniform(keys[0], (size, 1)) < 0.01
-    drawn = now.model.sample_initial(keys[1], size)
-    return mixture.replace(particles=jnp.where(is_new, drawn, mixture.particles))
-
-
 def mixture(model: Any, num_particles: int, max_components: int) -> mpfjax.Filter:
     """Units are those of x, y, and the cosine and sine of the heading."""
     scale = (1.0, 1.0, 0.5, 0.5)
@@ -117,14 +103,11 @@ def mixture(model: Any, num_particles: int, max_components: int) -> mpfjax.Filte
 
 FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
     "particle filter": lambda model, n, m: mpfjax.particle_filter(model, n, ess_threshold=0.5),
-    "replacing 1%": lambda model, n, m: mpfjax.Filter(
-        model, [mpfjax.Resample(), replace_some, mpfjax.Propagate()], n
-    ),
     "AMCL": lambda model, n, m: mpfjax.Filter(as_amcl(model), [AdaptiveMonteCarlo()], 5000),
     "mixture": mixture,
     "mixture, with_restarts": lambda model, n, m: mpfjax.with_restarts(mixture(model, n, m)),
-    "mixture, with_initialisation": lambda model, n, m: mpfjax.with_initialisation(
-        mixture(model, n, m)
+    "mixture, with_initialisation": lambda model, n, m: mpfjax.with_alarm(
+        mpfjax.with_initialisation(mixture(model, n, m)), n
     ),
     "the same, with_restarts": lambda model, n, m: mpfjax.with_restarts(
         mpfjax.with_initialisation(mixture(model, n, m))
@@ -133,65 +116,57 @@ FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
         mpfjax.with_resampling(mixture(model, n, m), mpfjax.Resample(allocation="equal"))
     ),
 }
-NAMES = [*FILTERS, *([PEER] if importlib.util.find_spec("blackjax") else [])]
 
 
 class Trace(NamedTuple):
-    """What is kept of the steps of runs, (runs, t, ...)."""
+    """What is retained of the steps of a run, (t, ...)."""
 
     particles: Array
     log_weights: Array
-    localised: Array | np.ndarray
-    averages: Array | np.ndarray
+    localised: Array
+    averages: Array
     """The logarithms of w_slow and w_fast, of AMCL."""
 
 
-def run(
-    name: str, model: Any, size: int, components: int, keys: Array, series: Any, near: float
-) -> tuple[Trace, Any, Any]:
-    """Traces of runs on (observations, inputs), log Ẑ's increments, and "lost", (runs, t), if any.
+class Runs(NamedTuple):
+    """Traces of runs, (runs, t, ...), and what the filters say of themselves."""
 
-    "Lost" is the probability of `robots.lost` for filters with an alarm, and AMCL's own measure,
-    1 - w_fast / w_slow.
-    """
-    if name == PEER:
-        particles, logs, increments = _through_blackjax(model, size)(keys, series)
-        return Trace(particles, logs, np.empty(0), np.empty(0)), increments, None
+    trace: Trace
+    increments: np.ndarray
+    """of log Ẑ."""
+    lost: np.ndarray | None
+    """`robots.lost` of a filter with an alarm, and AMCL's own measure, 1 - w_fast / w_slow."""
+    milliseconds: np.ndarray
+    """of CPU time per scan, of each run."""
+
+
+def run(
+    name: str, model: Any, size: int, components: int, near: float,
+    drives: Iterable[tuple[Array, tuple[Any, Any]]],
+) -> list[Runs]:  # fmt: skip
+    """Runs one after the other on drives: keys, and (observations, inputs)."""
+    filter = FILTERS[name](model, size, components)
 
     def traced(mixture: mpfjax.ParticleMixture) -> Trace:
         averages = mixture.memory.get("averages", jnp.zeros(2))
         localised = robots.localised(mixture, near)
         return Trace(mixture.particles, mixture.log_weights, localised, averages)
 
-    filter = FILTERS[name](model, size, components)
-    runs = mpfjax.monte_carlo(keys, filter, mpfjax.Series(*series), traced)
-    trace, lost = runs.collected, None
-    if name == "AMCL":
+    return [_run(filter, traced, keys, mpfjax.Series(*series)) for keys, series in drives]
+
+
+def _run(filter: mpfjax.Filter, traced: Any, keys: Array, data: mpfjax.Series) -> Runs:
+    # Not under `vmap`, where a restart of one run takes the time of a restart of all.
+    runs, seconds = [], []
+    for key in keys:
+        began = time.process_time()
+        runs.append(jax.device_get(mpfjax.run_filter(key, filter, data, traced)))
+        seconds.append(time.process_time() - began)
+    each = jax.tree.map(lambda *leaves: np.stack(leaves), *runs)
+    trace, lost = each.collected, None
+    if "averages" in runs[0].final.memory:
         lost = -np.expm1(np.minimum(trace.averages[..., 1] - trace.averages[..., 0], 0.0))
-    elif runs.log_evidence_against_start is not None:
-        lost = robots.lost(trace.localised, runs.log_evidence_against_start)
-    return trace, runs.log_likelihood_increments, lost
-
-
-def milliseconds(name: str, model: Any, size: int, components: int, series: Any) -> float | None:
-    """Of a scan, in the second of two runs."""
-    if name == PEER:
-        return None
-    filter, data = FILTERS[name](model, size, components), mpfjax.Series(*series)
-    seconds = []
-    for seed in range(2):
-        began = time.perf_counter()
-        mpfjax.run_filter(jax.random.key(seed), filter, data).final.particles.block_until_ready()
-        seconds.append(time.perf_counter() - began)
-    return 1e3 * seconds[-1] / data.length
-
-
-def _through_blackjax(model: Any, size: int) -> Callable[..., Any]:
-    """A row of the series is (observation, inputs)."""
-    one = blackjax_steps(
-        lambda key: model.sample_initial(key, size),
-        lambda key, x, row: model.with_inputs(row[1]).sample_transition(key, x),
-        lambda row, x: model.log_likelihood(row[0], x),
-        lambda state, increment: (state.particles, jnp.log(state.weights), increment),
-    )
-    return jax.jit(jax.vmap(one, in_axes=(0, None)))
+    elif each.log_evidence_against_start is not None:
+        lost = robots.lost(trace.localised, each.log_evidence_against_start)
+    times = 1e3 * np.array(seconds) / data.length
+    return Runs(trace, each.log_likelihood_increments, lost, times)

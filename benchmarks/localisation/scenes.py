@@ -109,6 +109,11 @@ class Scene(NamedTuple):
     near: float
     drives: list[Stretch]
 
+    @property
+    def carried(self) -> int:
+        """The scans of a drive, after which the robot is carried away."""
+        return len(self.drives[0].poses)
+
 
 class Errors(NamedTuple):
     """Of what is simulated, in metres and radians."""
@@ -178,16 +183,24 @@ def drawn(
     return scene._replace(drives=[each._replace(seen=abs(each.seen)) for each in scene.drives])
 
 
-def amcl(seed: int, steps: int | None) -> Scene:
-    """TurtleBot3's world with AMCL's sensor: 60 beams all around, its weights and deviation."""
+def amcl(seed: int, steps: int | None, boxes: int = 0) -> Scene:
+    """TurtleBot3's world with AMCL's sensor: 60 beams all around, its weights and deviation.
+
+    So many boxes of 30 cm, which are not on the map, stand in the robot's way.
+    """
     grid, errors = turtlebot_map(), Errors(range=0.02, most=3.5)
     sensor = robots.LikelihoodField(2 * np.pi * np.arange(60) / 60, laser_max_range=errors.most)
     model = robots.RobotModel(grid, GivenDeviations(), sensor, clearance=0.12)
+    walls, rng = np.array(grid.occupied), np.random.default_rng([seed, 2])
+    for row, column in rng.permutation(np.argwhere(grid.free))[:boxes]:
+        walls[row : row + 6, column : column + 6] = True
+    actual = robots.OccupancyGrid(walls, np.array(grid.free), resolution=grid.resolution)
+    world = robots.RobotModel(actual, GivenDeviations(), sensor, clearance=0.12)
 
     def ranges(poses: Array) -> Array:
-        return grid.ranges(poses, sensor.angles, errors.most)
+        return actual.ranges(poses, sensor.angles, errors.most)
 
-    return simulated(model, ranges, errors, seed, lambda rng: wander(model, steps or 20, rng))
+    return simulated(model, ranges, errors, seed, lambda rng: wander(world, steps or 20, rng))
 
 
 def turtlebot_map() -> robots.OccupancyGrid:
@@ -323,5 +336,6 @@ def with_people(scene: Scene, share: float, seed: int) -> Scene:
 # By name: those whose data are there, and those that always are.
 SCENES: dict[str, Callable[[int, int | None], Scene]]
 SCENES = {name: partial(building, name) for name in LOGS}
-SCENES |= {"turtlebot": turtlebot, "amcl": amcl} if MAP.is_file() else {}
+if MAP.is_file():
+    SCENES |= {"turtlebot": turtlebot, "amcl": amcl, "boxes": partial(amcl, boxes=8)}
 SCENES |= {name: partial(rooms, name) for name in ROOMS} | {"ring": ring}
