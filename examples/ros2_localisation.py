@@ -82,7 +82,7 @@ class Localisation(Node):
         )  # fmt: skip
         model = robots.RobotModel(self.grid, robots.OdometryMotion(), sensor, clearance=0.1)
         plain = mpfjax.mixture_particle_filter(model, 2000, 16, scale=(1.0, 1.0, 0.5, 0.5))
-        filter = mpfjax.with_restarts(mpfjax.with_start(plain))
+        filter = mpfjax.with_restarts(mpfjax.with_initialisation(plain))
         headers = deque([scan.header])
 
         def pairs() -> Any:
