@@ -135,8 +135,10 @@ class Found(NamedTuple):
 
 def found_of(name: str, scene: Scene, drive: Stretch, runs: Runs) -> Found:
     """Of the runs on a drive and on the next one: where the particles are."""
-    poses, (particles, logs, *_) = drive.poses, runs.trace
-    x, y, turn = np.moveaxis(particles - poses[None, :, None].astype(particles.dtype), -1, 0)
+    poses, trace = drive.poses, runs.trace
+    particles, logs = np.asarray(trace.particles), np.asarray(trace.log_weights)
+    away = particles - poses[None, :, None].astype(particles.dtype)
+    x, y, turn = np.moveaxis(away, -1, 0)
     turned = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
     near = (np.hypot(x, y) < scene.near) & (turned < 0.4)
     weights = np.exp(logs)
