@@ -27,7 +27,7 @@ ESTIMATORS = {
     "pathwise": "stop-gradient, draws differentiated",
     "stop": "stop-gradient",
 }
-PARTS = ("gradients", "shifts", "learned", "many_dimensions", "scores")
+PARTS = ("gradients", "shifts", "learned", "coverage", "many_dimensions", "scores")
 MODELS = {"linear_gaussian": ("a", "log q", "log r"), "quadratic": ("log σ_x", "log σ_y")}
 # Drawn once: under double precision the same key would draw another set.
 OBSERVATIONS = np.asarray(simulate(2)[1])
@@ -55,11 +55,11 @@ def main(
 ) -> None:
     """Cell by cell; what is finished is written.
 
-    - `parts`: scores of two models; gradients, the shift of the maximum, and learned parameters of
-      stochastic volatility; the filters in many dimensions.
+    - `parts`: scores of two models; gradients, the shift of the maximum, learned parameters and
+      coverage of their intervals for stochastic volatility; the filters in many dimensions.
     - `runs`: seeds for each estimator.
     - `methods`: of `fit`, on stochastic volatility.
-    - `series`: of each data set of stochastic volatility.
+    - `series`: of each data set of stochastic volatility; a fifth of it for coverage.
     - `steps`: of `fit` on each of the `data_sets`.
     - `dimensions`: of the linear-Gaussian model.
     """
@@ -68,6 +68,9 @@ def main(
         "gradients": lambda: volatility.gradients(methods, runs, seed),
         "shifts": lambda: volatility.shifts(methods, series, 2, seed),
         "learned": lambda: volatility.learned(methods, series, data_sets, steps, seed),
+        "coverage": lambda: volatility.coverage(
+            methods, max(series // 5, 1), data_sets, steps, seed
+        ),
         "many_dimensions": lambda: many_dimensions.errors(dimensions, runs // 10, seed),
     }
     for part in parts:

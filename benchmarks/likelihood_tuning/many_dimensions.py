@@ -36,13 +36,13 @@ def model_of(dimensions: int) -> mpfjax.LinearGaussianModel:
 
 def filters_of(model: mpfjax.LinearGaussianModel) -> dict[str, mpfjax.Filter]:
     """Bootstrap and guided, with independent draws and with point sets."""
-    found = {}
-    for noise in ("independent", "rqmc"):
-        for name, proposal in (("", None), (", optimal proposal", mpfjax.GaussNewtonProposal())):
-            found[noise + name] = mpfjax.particle_filter(
-                model, NUM_PARTICLES, proposal=proposal, noise=noise
-            )
-    return found
+    # Exact for a linear model; an inflation of 1.1 would double the error of Ẑ in 25 dimensions.
+    optimal = mpfjax.GaussNewtonProposal(num_iterations=1, inflation=1.0)
+    return {
+        noise + name: mpfjax.particle_filter(model, NUM_PARTICLES, proposal=proposal, noise=noise)
+        for noise in ("independent", "rqmc")
+        for name, proposal in (("", None), (", optimal proposal", optimal))
+    }
 
 
 def errors(dimensions: int, runs: int, seed: int) -> tuple[str, str, list[dict[str, Any]]]:
@@ -70,8 +70,8 @@ def errors(dimensions: int, runs: int, seed: int) -> tuple[str, str, list[dict[s
         call = jax.jit(jax.vmap(estimated))
         jax.block_until_ready(call(keys, observations))
         start = process_time()
-        found, logs = jax.block_until_ready(call(keys, observations))
-        squares = np.asarray(jnp.sum((found - means) ** 2, axis=-1).mean(axis=1))
+        estimates, logs = jax.block_until_ready(call(keys, observations))
+        squares = np.asarray(jnp.sum((estimates - means) ** 2, axis=-1).mean(axis=1))
         ratios = np.asarray(jnp.abs(1 - jnp.exp(logs - increments)).mean(axis=1))
         entries.append({
             "filter": name, "mean": squares.mean(), "likelihood": ratios.mean(),

@@ -22,7 +22,9 @@ from jaxtyping import Array, Float
 import mpfjax
 from benchmarks import harness
 from mpfjax.exact import grid_filter
+from mpfjax.models.observations import Series
 from mpfjax.tuning import Interval, Positive, fit
+from mpfjax.tuning.evidence import FisherEvidence, LogEvidence
 from mpfjax.tuning.problem import Reals
 
 LENGTH = 101
@@ -40,14 +42,15 @@ PUBLISHED = [
 ]  # fmt: skip
 ERRORS = {name: f"{{{name}:.4f}}" for name in TRUTH}
 Table = tuple[str, str, list[dict[str, Any]]]  # its title, what it shows, and its entries
-# Of fit: the estimator of the filter, whether seeds are pooled, their number, and what it is.
-METHODS = {
-    "none": ("none", False, 1, "no gradient of resampling, K = 1"),
-    "one": ("stop", False, 1, "mean of log Ẑ, K = 1"),
-    "mean": ("stop", False, 8, "mean of log Ẑ, K = 8"),
-    "pooled": ("stop", True, 8, "log of mean Ẑ, K = 8"),
+# Of fit: the gradient of the filter, the score, whether seeds are pooled, their number, a title.
+METHODS: dict[str, tuple[Any, Any, bool, int, str]] = {
+    "none": ("none", "filter", False, 1, "no gradient of resampling, K = 1"),
+    "one": ("stop", "filter", False, 1, "mean of log Ẑ, K = 1"),
+    "mean": ("stop", "filter", False, 8, "mean of log Ẑ, K = 8"),
+    "pooled": ("stop", "filter", True, 8, "log of mean Ẑ, K = 8"),
+    "fisher": ("none", "fisher", True, 8, "log of mean Ẑ, K = 8, Fisher's identity"),
 }
-NUM_PARTICLES, BATCH, NUM_STEPS = 100, 32, 160
+NUM_PARTICLES, BATCH, NUM_STEPS, CURVATURE_SEEDS = 100, 32, 160, 16
 
 
 class StochasticVolatility(mpfjax.AbstractStateSpaceModel):
@@ -99,13 +102,10 @@ def simulate(num_series: int, seed: int) -> Float[np.ndarray, "series t"]:
     return np.array(rows, np.float32).T
 
 
-def volatility_filter(estimator: Any, start: dict[str, Any]) -> mpfjax.Filter:
-    """The bootstrap filter; "pathwise" differentiates the draws."""
+def volatility_filter(gradient: Any, start: dict[str, Any]) -> mpfjax.Filter:
+    """The bootstrap filter."""
     model = StochasticVolatility(**start)
-    if estimator == "pathwise":
-        moves = [mpfjax.Resample(gradient="stop"), mpfjax.Propagate()]
-        return mpfjax.Filter(model, moves, NUM_PARTICLES)
-    return mpfjax.particle_filter(model, NUM_PARTICLES, gradient=estimator)
+    return mpfjax.particle_filter(model, NUM_PARTICLES, gradient=gradient)
 
 
 def constrained(reals: Reals) -> dict[str, Array]:
@@ -131,26 +131,26 @@ def exact_scores(reals: Reals, observations: Float[Array, "s t"]) -> Float[Array
     return jax.lax.map(lambda y: jnp.stack([*score(reals, y).values()]), observations, batch_size=8)
 
 
-@partial(jax.jit, static_argnames=("estimator", "num_seeds", "pooled"))
+@partial(jax.jit, static_argnames="method")
 def estimated_scores(
-    reals: Reals, observations: Array, keys: Array, estimator: str, num_seeds: int, pooled: bool
+    reals: Reals, observations: Array, keys: Array, method: str
 ) -> Float[Array, "s 3"]:
-    """The same by the filter, with one key for each series."""
+    """The same by a method of `fit`, with one key for each series."""
+    gradient, score, pooled, num_seeds, _ = METHODS[method]
+    evidence = FisherEvidence if score == "fisher" else LogEvidence
 
     @jax.grad
-    def score(reals: Reals, y: Array, key: Array) -> Array:
-        filter = volatility_filter(estimator, constrained(reals))
-
-        def log_evidence(key: Array) -> Array:
-            return mpfjax.run_filter(key, filter, y, harness.nothing).log_marginal_likelihood
-
-        values = jax.vmap(log_evidence)(jax.random.split(key, num_seeds))
+    def derivative(reals: Reals, y: Array, key: Array) -> Array:
+        filter, of_series = volatility_filter(gradient, constrained(reals)), evidence([Series(y)])
+        keys = jax.random.split(key, num_seeds)
+        values = jax.vmap(lambda key: of_series(key, filter)[0])(keys)
         return logsumexp(values) if pooled else jnp.mean(values)
 
     def of_series(one: tuple[Array, Array]) -> Array:
-        return jnp.stack([*score(reals, *one).values()])
+        return jnp.stack([*derivative(reals, *one).values()])
 
-    return jax.lax.map(of_series, (observations, keys), batch_size=64 // num_seeds)
+    rows = observations[:, None], keys
+    return jax.lax.map(of_series, rows, batch_size=64 // num_seeds)
 
 
 def gradients(methods: Sequence[str], runs: int, seed: int) -> Table:
@@ -161,12 +161,12 @@ def gradients(methods: Sequence[str], runs: int, seed: int) -> Table:
     exact = float(exact_scores(at, y)[0, 0]) / slope
     keys, entries = jax.random.split(jax.random.key(seed), runs), []
     copies = jnp.broadcast_to(y, (runs, LENGTH))
-    for estimator, pooled, num_seeds, method in (METHODS[name] for name in methods):
+    for method in methods:
         start = process_time()
-        rows = np.asarray(estimated_scores(at, copies, keys, estimator, num_seeds, pooled))
+        rows = np.asarray(estimated_scores(at, copies, keys, method))
         values = rows[:, 0] / slope
         entries.append({
-            "method": method, "exact": exact, "bias": float(values.mean() - exact),
+            "method": METHODS[method][-1], "exact": exact, "bias": float(values.mean() - exact),
             "standard_error": float(values.std(ddof=1) / np.sqrt(runs)),
             "deviation": float(values.std(ddof=1)), "seconds": process_time() - start,
         })  # fmt: skip
@@ -205,11 +205,11 @@ def shifts(methods: Sequence[str], num_series: int, repeats: int, seed: int) -> 
     repeated = jnp.tile(observations, (repeats, 1))
     exact = np.tile(np.asarray(exact_scores(point, observations), float), (repeats, 1))
     keys, entries = jax.random.split(jax.random.key(seed), len(repeated)), []
-    for estimator, pooled, num_seeds, method in (METHODS[name] for name in methods):
-        rows = estimated_scores(point, repeated, keys, estimator, num_seeds, pooled)
+    for method in methods:
+        rows = estimated_scores(point, repeated, keys, method)
         moves = -num_series * np.linalg.solve(hessian, (np.asarray(rows, float) - exact).T).T
         error = moves.std(axis=0, ddof=1) / np.sqrt(len(moves))
-        entry = {"method": method, "maximum": jax.tree.map(float, constrained(point))}
+        entry = {"method": METHODS[method][-1], "maximum": jax.tree.map(float, constrained(point))}
         entry["shift"] = dict(zip(TRUTH, moves.mean(axis=0).tolist(), strict=True))
         entries.append(entry | {"error": dict(zip(TRUTH, error.tolist(), strict=True))})
     names = {"logit α": "alpha", "log β": "beta", "log σ": "sigma"}
@@ -240,21 +240,48 @@ def learned(
     return "Mean errors of learned parameters", harness.table(columns, rows + PUBLISHED), entries
 
 
-def learned_from(num_series: int, method: str, steps: int, seed: int) -> dict[str, Any]:
+def coverage(
+    methods: Sequence[str], num_series: int, data_sets: int, steps: int, seed: int
+) -> Table:
+    """The share of 90% intervals, by the standard errors of `fit`, that hold the true parameter."""
+    entries = [
+        learned_from(num_series, method, steps, seed + number, CURVATURE_SEEDS)
+        for method, number in harness.grid("fit", methods, range(data_sets))
+    ]
+    rows = []
+    for method in methods:
+        of_method = [e for e in entries if e["method"] == method and e["standard_errors"]]
+        shares = {
+            name: np.mean(
+                [e[name] < norm.ppf(0.95) * e["standard_errors"][name] for e in of_method]
+            )
+            for name in TRUTH
+        }
+        rows.append({"method": METHODS[method][-1], "number": len(of_method)} | shares)
+    columns = {"method": "{method}", "data sets": "{number}"}
+    columns |= {name: f"{{{name}:.2f}}" for name in TRUTH}
+    title = f"Coverage of 90% intervals, data sets of {num_series} series"
+    return title, harness.table(columns, rows), entries
+
+
+def learned_from(
+    num_series: int, method: str, steps: int, seed: int, curvature_seeds: int = 0
+) -> dict[str, Any]:
     """The parameters that `fit` finds on one data set, from a random start as published."""
     rng = np.random.default_rng([seed, 1])
     start = {"alpha": rng.uniform(), "beta": rng.uniform(0.0, 2.0), "sigma": rng.uniform(0.0, 5.0)}
-    estimator, pooled, num_seeds, _ = METHODS[method]
+    gradient, score, pooled, num_seeds, _ = METHODS[method]
     began = process_time()
     with warnings.catch_warnings(action="ignore"):  # of the biases that are measured here
         run = fit(
-            jax.random.key(seed), volatility_filter(estimator, start),
+            jax.random.key(seed), volatility_filter(gradient, start),
             list(simulate(num_series, seed)), optax.adam(optax.cosine_decay_schedule(0.15, steps)),
             steps, parameters=PARAMETERS, transforms=TRANSFORMS, num_seeds=num_seeds,
-            batch=min(BATCH, num_series), pooled=pooled, progress=False,
+            batch=min(BATCH, num_series), pooled=pooled, score=score,
+            curvature_seeds=curvature_seeds, progress=False,
         )  # fmt: skip
     errors = {name: abs(float(run.parameters[name]) - true) for name, true in TRUTH.items()}
-    effective = np.asarray(run.effective_seeds).mean()
     return {"method": method, "seed": seed, "seconds": process_time() - began} | errors | {
-        "effective_seeds": effective, "start": start,
+        "effective_seeds": np.asarray(run.effective_seeds).mean(), "start": start,
+        "standard_errors": run.standard_errors,
     }  # fmt: skip

@@ -71,19 +71,14 @@ class LongRun:
     progress: bool
     identity: Callable[[int], Mapping[str, str]]
 
-    def go(
-        self, like: State, start: Callable[[], State], advance: Advance
-    ) -> tuple[State, str | None]:
+    def go(self, start: State, advance: Advance) -> tuple[State, str | None]:
         """The state after all steps, and why there are fewer, if there are.
 
-        The run goes on from its file, or starts. `like` is a state as it could start, or the shapes
-        of one. Ctrl-C, and what is `Broken`, end it with a warning and the steps before; without
-        any row, Ctrl-C is raised, and what is broken at the start is a RuntimeError.
+        The run goes on from its file if there is one, unless the start has steps behind it. Ctrl-C,
+        and what is `Broken`, end it with a warning and the steps before; without any row, Ctrl-C is
+        raised, and what is broken at the start is a RuntimeError.
         """
-        return self.go_on(self._load(like) or start(), advance)
-
-    def go_on(self, state: State, advance: Advance) -> tuple[State, str | None]:
-        """Advance from a state to the last step."""
+        state = start if start.step else self._load(start) or start
         every = self.last if self.checkpoint is None else self.checkpoint.every
         pieces, last_save, stopped = [state.rows], state.step, None
         bar = tqdm(total=self.last, initial=state.step, disable=not self.progress, unit="step")

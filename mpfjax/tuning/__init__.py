@@ -7,10 +7,10 @@ from mpfjax.tuning.comparison import compare_evidence as compare_evidence
 from mpfjax.tuning.curvature import standard_errors as standard_errors
 from mpfjax.tuning.densities import log_density as log_density
 from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
-from mpfjax.tuning.happened import posterior_trajectories as posterior_trajectories
 from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
 from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
 from mpfjax.tuning.optimisation import fit as fit
 from mpfjax.tuning.optimisation import maximise as maximise
-from mpfjax.tuning.predictive import posterior_predictive as posterior_predictive
 from mpfjax.tuning.sequential import smc2 as smc2
+from mpfjax.tuning.trajectories import posterior_predictive as posterior_predictive
+from mpfjax.tuning.trajectories import posterior_trajectories as posterior_trajectories

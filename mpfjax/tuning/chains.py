@@ -150,14 +150,9 @@ class Sampling(Checked):
         last = self.burn_in + num_draws * self.thinning
         run = LongRun(self.caller, last, self.checkpoint, self.progress, lambda step: identity)
         key_starts, key_steps = jax.random.split(self.key)
-        like, _, none = eqx.filter_eval_shape(self._starts, kernel, key_starts)
-        none = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), none)
-
-        def start() -> State:
-            return State(0, self._started(kernel, key_starts), none)
-
+        chains, none = self._started(kernel, key_starts)
         advance = self._advance(kernel, key_steps, none)
-        state, stopped = run.go(State(0, like, none), start, advance)
+        state, stopped = run.go(State(0, chains, none), advance)
         reals, *rest = jax.tree.map(lambda rows: np.moveaxis(rows[:num_draws], 0, 1), state.rows)
         num_invalid = jax.tree.map(np.asarray, state.carry.num_invalid)
         warn_of_invalid(self.caller, num_invalid)
@@ -184,12 +179,12 @@ class Sampling(Checked):
         keys = jax.random.split(key, num)
         return _start_all(kernel, keys, reals, random_walk(self.deviations, reals))
 
-    def _started(self, kernel: AbstractKernel, key: Key[Array, ""]) -> Chains:
-        """All chains at their starts.
+    def _started(self, kernel: AbstractKernel, key: Key[Array, ""]) -> tuple[Chains, PyTree]:
+        """All chains at their starts, and reports of no steps.
 
         A draw of the prior at which a chain cannot start is drawn again.
         """
-        chains, fine, _ = self._starts(kernel, key)
+        chains, fine, none = self._starts(kernel, key)
         where = "the start" if self.sample_prior is None else "any draw of sample_prior"
         for attempt in range(1, _MOST_DRAWS_OF_A_START if self.sample_prior else 1):
             if np.all(fine):
@@ -201,7 +196,7 @@ class Sampling(Checked):
             chains, fine = Chains(states, walk, chains.num_invalid), fine | now_fine
         if not np.all(fine):
             raise RuntimeError(f"{self.caller}: the prior or likelihood was NaN or inf at {where}")
-        return chains
+        return chains, jax.tree.map(np.asarray, none)
 
     def _num_draws(self, step: int) -> int:
         """How many draws there are after some steps."""
@@ -236,9 +231,9 @@ class Sampling(Checked):
 
 def warn_of_invalid(caller: str, num_invalid: Mapping[str, Any]) -> None:
     """Warn of densities that were not numbers, by their names."""
-    found = [f"{name} {np.sum(each)} times" for name, each in num_invalid.items() if np.any(each)]
-    if found:
-        warn(f"{caller}: NaN or +inf, taken for zero density: {', '.join(found)}", UserWarning)
+    counts = [f"{name} {np.sum(each)} times" for name, each in num_invalid.items() if np.any(each)]
+    if counts:
+        warn(f"{caller}: NaN or +inf, taken for zero density: {', '.join(counts)}", UserWarning)
 
 
 @jit_on_wide_vectors

@@ -67,25 +67,25 @@ def compare_evidence(models: Mapping[str, Runs]) -> Comparison:
     """
     if not isinstance(models, Mapping) or len(models) < 2:
         raise ValueError(f"models: {shown(models)} are not two models or more, by name")
-    lengths, found = set(), {}
+    lengths, evidence = set(), {}
     for name, runs in models.items():
-        if isinstance(runs, SequentialPosterior):
-            found[name] = runs.log_marginal_likelihood, runs.log_marginal_likelihood_error
-            if not np.isfinite(found[name]).all():
+        runs = [runs] if isinstance(runs, SequentialPosterior) else runs
+        posteriors = [run for run in runs if isinstance(run, SequentialPosterior)]
+        lengths |= {len(run.log_likelihood_increments) for run in posteriors}
+        if len(runs) == len(posteriors) == 1:
+            (run,) = posteriors
+            evidence[name] = run.log_marginal_likelihood, run.log_marginal_likelihood_error
+            if not np.isfinite(evidence[name]).all():
                 raise ValueError(f"models: one run of {name} gives no error; give several runs")
-            lengths.add(len(runs.log_likelihood_increments))
             continue
-        estimates = []
-        for run in runs:
-            if isinstance(run, SequentialPosterior):
-                lengths.add(len(run.log_likelihood_increments))
-                run = run.log_marginal_likelihood
-            estimates.append(float(run))
-        found[name] = _pooled(name, estimates)
+        evidence[name] = _pooled(name, [
+            run.log_marginal_likelihood if isinstance(run, SequentialPosterior) else float(run)
+            for run in runs
+        ])  # fmt: skip
     if len(lengths) > 1:
         raise ValueError(f"models: of {sorted(lengths)} observations, not of the same")
-    order = sorted(found, key=lambda name: -found[name][0])
-    values, errors = ({name: found[name][k] for name in order} for k in (0, 1))
+    order = sorted(evidence, key=lambda name: -evidence[name][0])
+    values, errors = ({name: evidence[name][k] for name in order} for k in (0, 1))
     return Comparison(values, errors)
 
 

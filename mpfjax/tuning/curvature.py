@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import Count, checked, warn
 from mpfjax.filter import Filter
 from mpfjax.tuning.bijections import Unconstrained
-from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
+from mpfjax.tuning.evidence import Score, pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms, score_of_each
 
 _MOST_NUMBERS = 50
@@ -35,6 +35,7 @@ def standard_errors(
     parameters: Parameters = None,
     transforms: Transforms = None,
     num_seeds: Count = 100,
+    score: Score = "filter",
 ) -> dict[str, np.ndarray] | None:
     """Standard errors of a filter's parameters at the maximum of the likelihood.
 
@@ -43,8 +44,9 @@ def standard_errors(
     differences of the mean score, over about one standard error to each side, with the same seeds
     on both sides. A few tries determine that distance, starting from the size of the score, so the
     parameters may have any units. The scores must be unbiased: build the filter with
-    `gradient="stop"`; otherwise there is a warning. The computation takes one gradient of
-    `num_seeds` runs, and for each try two for each coordinate; usually two tries, at most ten.
+    `gradient="stop"`, or use `score="fisher"`; otherwise there is a warning. The computation takes
+    one gradient of `num_seeds` runs, and for each try two for each coordinate; usually two tries,
+    at most ten.
 
     The arguments are those of `fit`. Noise in I makes the errors too large rather than too small. A
     warning is issued if there are too few seeds: if the standard error of one of the errors is more
@@ -54,7 +56,7 @@ def standard_errors(
     direction that the data do not determine, or with too few seeds. Raises `ValueError` as `fit`
     does, and for fewer than one seed, and more than fifty coordinates.
     """
-    problem = pose_evidence(filter, observations, parameters, transforms)
+    problem = pose_evidence(filter, observations, parameters, transforms, score)
     warn_of_bias("standard_errors", problem)
     batches = [jax.random.split(key, num_seeds)]
     return errors_at([problem], problem.start(), batches, "num_seeds")
@@ -74,18 +76,16 @@ def errors_at(
         raise ValueError(f"parameters: {point.size} numbers; differences do for {_MOST_NUMBERS}")
 
     fold = jax.vmap(jax.random.fold_in, (0, None))
-    keys_of_problems = [
-        [fold(keys, number) if number else keys for keys in batches]
-        for number in range(len(problems))
-    ]
 
     def score(flat: np.ndarray) -> Float[np.ndarray, "seeds d"]:
         at = unravel(jnp.asarray(flat))
         each = [
-            np.concatenate([np.asarray(score_of_each(keys, part, at), float) for keys in keys_of])
-            for part, keys_of in zip(problems, keys_of_problems, strict=True)
-        ]
-        return np.sum(each, axis=0)
+            np.concatenate([
+                score_of_each(fold(keys, number) if number else keys, part, at) for keys in batches
+            ])
+            for number, part in enumerate(problems)
+        ]  # fmt: skip
+        return np.sum(each, axis=0, dtype=float)
 
     # By number, how far a step may go.
     longest = np.concatenate([
@@ -95,8 +95,8 @@ def errors_at(
     informations = _informations(score, np.asarray(point), longest)
     covariance = _inverse(informations.mean(axis=0))
     if covariance is None:
-        said = "the log marginal likelihood has no maximum here, or too few seeds to see it"
-        warn(f"standard_errors: {said}", UserWarning)
+        what = "the log marginal likelihood has no maximum here, or too few seeds to see it"
+        warn(f"standard_errors: {what}", UserWarning)
         return None
     _warn_of_noise(informations, covariance, of_seeds)
     # By the Jacobian of the parameters on their own scale, laid out in the same order.
@@ -133,14 +133,14 @@ def _informations(
             # Over the actual distance of the two points, after rounding.
             slopes = (score(below) - score(above)) / (float(above[axis]) - float(below[axis]))
             # Twice the loss of a step in nats, for a parabola.
-            told = abs(slopes[:, axis].mean()) * step**2
+            loss = abs(slopes[:, axis].mean()) * step**2
             if not np.isfinite(slopes).all():
                 # Outside the model's domain.
                 most, following = step / 2, step / 8
-            elif _NEAR[0] <= told <= _NEAR[1]:
+            elif _NEAR[0] <= loss <= _NEAR[1]:
                 break
             else:
-                factor = _FURTHEST_ROUND if told == 0 else 1 / np.sqrt(told)
+                factor = _FURTHEST_ROUND if loss == 0 else 1 / np.sqrt(loss)
                 following = step * np.clip(factor, 1 / _FURTHEST_ROUND, _FURTHEST_ROUND)
             following = float(np.clip(following, least, max(least, most)))
             if following == step:
@@ -177,5 +177,5 @@ def _warn_of_noise(
     uncertain = of_each.std(axis=0, ddof=1).max() / 2 / num_seeds**0.5 if num_seeds > 1 else np.inf
     if uncertain > _MOST_UNCERTAIN:
         by = f" by {uncertain:.0%}" if num_seeds > 1 else ""
-        said = f"{num_seeds} seeds leave them uncertain{by}; raise {of_seeds}"
-        warn(f"standard_errors: {said}", UserWarning)
+        what = f"{num_seeds} seeds leave them uncertain{by}; raise {of_seeds}"
+        warn(f"standard_errors: {what}", UserWarning)

@@ -1,7 +1,6 @@
 """The log marginal likelihood of a filter as an objective of its parameters."""
 
-from itertools import chain
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax
@@ -10,11 +9,16 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Rule, kinds, warn
-from mpfjax.filter import Filter
+from mpfjax.filter import Filter, check_keep_parents
+from mpfjax.models.base import require, with_inputs
+from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.models.observations import Series, as_series, series_of
 from mpfjax.moves.base import AbstractProposal, all_of
 from mpfjax.running.results import FilterRun
 from mpfjax.running.scan import scan
+from mpfjax.smoothing.backward import log_transitions
+from mpfjax.smoothing.history import mixtures_of
+from mpfjax.smoothing.trajectories import draw_trajectories
 from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, placed, pose
 
 UnbiasedFilter = Annotated[
@@ -24,6 +28,11 @@ UnbiasedFilter = Annotated[
         "a filter with an unbiased likelihood: none of its moves is approximate",
     ),
 ]
+
+
+Score = Literal["filter", "fisher"]
+_BY_FISHER = 'score="fisher"'
+_NUM_PATHS = 8  # of each run: then noise in which run is weighted how is as large as theirs
 
 
 class LogEvidence(eqx.Module):
@@ -53,7 +62,7 @@ class LogEvidence(eqx.Module):
 
     def part(self, group: int, rows: np.ndarray) -> "LogEvidence":
         """That of some sequences of one group."""
-        return LogEvidence([jax.tree.map(lambda leaf: leaf[rows], self.groups[group])])
+        return type(self)([jax.tree.map(lambda leaf: leaf[rows], self.groups[group])])
 
     def runs(self, key: Key[Array, ""], filter: Filter, whole: bool = False) -> list[FilterRun]:
         """The runs of each group, with all mixtures collected, or nothing."""
@@ -68,27 +77,95 @@ class LogEvidence(eqx.Module):
         ]
 
 
+class LogJoint(eqx.Module):
+    """log p(x_0, ..., x_t, y_1, ..., y_t | θ) of a trajectory and the observations there are."""
+
+    series: Series
+
+    def __call__(self, trajectory: PyTree, filter: Filter) -> Float[Array, ""]:
+        """With the parameters of the filter's model."""
+        model = law_of(filter.model).model
+        start = jax.tree.map(lambda leaf: leaf[:1], trajectory)
+        after = jax.tree.map(lambda leaf: leaf[1:], trajectory)
+
+        def log_likelihood(observation: PyTree, inputs: PyTree, state: PyTree) -> Float[Array, ""]:
+            one = jax.tree.map(lambda leaf: leaf[None], state)
+            return law_of(with_inputs(model, inputs)).log_likelihood(observation, one)[0]
+
+        rows, present = (self.series.observations, self.series.inputs, after), self.series.present
+        if present is not None:
+            # A missing step stands for the first that is there, whose derivative is a number.
+            places = jnp.where(present, jnp.arange(len(present)), jnp.argmax(present))
+            rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[places], rows)
+        logs = jax.vmap(log_likelihood)(*rows)
+        if present is not None:
+            logs = jnp.where(present, logs, 0.0)
+        steps = jnp.sum(log_transitions(model, trajectory, self.series.inputs))
+        return model.log_initial(start)[0] + steps + jnp.sum(logs)
+
+
+class FisherEvidence(LogEvidence):
+    """log Ẑ of each sequence, whose derivatives estimate the score by Fisher's identity.
+
+    ∇ log Z(θ) = E[∇ log p(x_0, ..., x_t, y_1, ..., y_t | θ) | y_1..y_t], over trajectories that are
+    drawn backwards through the run, which is itself no function of θ here.
+    """
+
+    def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, " series"]:
+        """log Ẑ of one run for each sequence."""
+        fixed = jax.tree.map(
+            lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, filter
+        )
+
+        def log_joint(key: Key[Array, ""], run: FilterRun, series: Series) -> Float[Array, ""]:
+            paths, _ = draw_trajectories(
+                key, fixed.model, mixtures_of(run), series.inputs, _NUM_PATHS, num_moves=1
+            )
+            return jnp.mean(jax.vmap(LogJoint(series), (0, None))(paths, filter))
+
+        values, key_runs = [], jax.random.fold_in(key, len(self.groups))
+        for g, runs in enumerate(self.runs(key_runs, fixed, whole=True)):
+            group = self.groups[g]
+            keys = jax.random.split(jax.random.fold_in(key, g), group.length)
+            logs = jax.vmap(log_joint)(keys, runs, group)
+            # The difference is zero, and has the derivative.
+            values.append(runs.log_marginal_likelihood + (logs - jax.lax.stop_gradient(logs)))
+        return jnp.concatenate(values)
+
+
 def pose_evidence(
-    filter: Filter, observations: PyTree, parameters: Parameters, transforms: Transforms
+    filter: Filter,
+    observations: PyTree,
+    parameters: Parameters,
+    transforms: Transforms,
+    score: Score = "filter",
 ) -> Problem:
     """The problem of the log marginal likelihood; without `parameters`, in those of the model."""
+    if score == "fisher":
+        for density in ("log_transition", "log_initial"):
+            require(filter.model, density, _BY_FISHER)
+        refuse_marginalised(filter.model, _BY_FISHER)
+        check_keep_parents("filter", filter.moves, _BY_FISHER)
     sequences = observations if isinstance(observations, list) else [observations]
     if not sequences:
         raise ValueError("observations: there are no sequences")
-    groups: dict[str, list[Series]] = {}
-    places: dict[str, list[int]] = {}
+    groups: dict[str, list[tuple[int, Series]]] = {}
     for place, sequence in enumerate(sequences):
         series = as_series(sequence, filter.model)
         kind = kinds((series.observations, series.inputs))
-        groups.setdefault(kind, []).append(series)
-        places.setdefault(kind, []).append(place)
-    stacked = []
-    for group in groups.values():
+        groups.setdefault(kind, []).append((place, series))
+    stacked, places = [], []
+    for numbers, group in (zip(*pairs, strict=True) for pairs in groups.values()):
         if any(series.present is not None for series in group):
             group = [with_present(series) for series in group]
         stacked.append(jax.tree.map(lambda *leaves: jnp.stack(leaves), *group))
-    evidence = LogEvidence(stacked, tuple(chain.from_iterable(places.values())))
-    return pose(filter, evidence, parameters, transforms)
+        places += numbers
+    evidence = {"filter": LogEvidence, "fisher": FisherEvidence}[score]
+    objective = evidence(stacked, tuple(places))
+    problem = pose(filter, objective, parameters, transforms)
+    if score == "fisher" and len(names_but_proposals(problem)) < len(problem.tuned):
+        raise ValueError('score: "fisher" has no derivative in parameters of a proposal')
+    return problem
 
 
 def one_sequence(observations: PyTree, model: Any) -> Series:
@@ -115,12 +192,14 @@ def warn_of_bias(caller: str, problem: Problem) -> None:
     It does not warn for parameters of proposals, whose bound is maximised without the derivative of
     the resampling, nor for filters that never resample.
     """
+    if isinstance(problem.objective, FisherEvidence):
+        return
     names = names_but_proposals(problem)
     moves = [move for move in all_of(problem.tree.moves) if move.biases_score]
     if names and moves:
-        said = f"{caller}: {type(moves[0]).__name__} has no gradient, so that the score of"
-        said += f' {", ".join(names)} is biased; build the filter with gradient="stop"'
-        warn(said, UserWarning)
+        what = f"{type(moves[0]).__name__} has no gradient, so that the score of {', '.join(names)}"
+        what += ' is biased; build the filter with gradient="stop", or use score="fisher"'
+        warn(f"{caller}: {what}", UserWarning)
 
 
 def with_present(series: Series) -> Series:

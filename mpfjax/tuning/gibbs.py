@@ -12,12 +12,10 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import Count, CountOrZero, checked, saying
 from mpfjax.filter import Filter
-from mpfjax.models.base import require, with_inputs
-from mpfjax.models.law import law_of
-from mpfjax.models.observations import Series, with_gaps
+from mpfjax.models.base import require
+from mpfjax.models.observations import with_gaps
 from mpfjax.running.long_runs import Checkpoint
 from mpfjax.running.scan import scan
-from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.conditional import (
     check_conditional,
     draw_trajectory,
@@ -36,7 +34,7 @@ from mpfjax.tuning.densities import (
     evaluated,
     is_invalid,
 )
-from mpfjax.tuning.evidence import one_sequence
+from mpfjax.tuning.evidence import LogJoint, one_sequence
 from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms, pose
 from mpfjax.tuning.walks import RandomWalk, checked_deviations, metropolis_step
 
@@ -149,30 +147,8 @@ def particle_gibbs(
     if draw is not None:  # Names and shapes are checked before anything compiles.
         jax.eval_shape(kernel.drawn, key, start, trajectory)
         functions["draw"] = (kernel.drawn, key, start, trajectory)
-    (kept, accepted, renewed), fields = sampling.run(kernel, {"observations": series}, functions)
-    return GibbsPosterior(trajectories=kept, accepted=accepted, renewed=renewed, **fields)
-
-
-class LogJoint(eqx.Module):
-    """log p(x_0, ..., x_t, y_1, ..., y_t | θ) of a trajectory and the observations there are."""
-
-    series: Series
-
-    def __call__(self, trajectory: PyTree, filter: Filter) -> Float[Array, ""]:
-        """With the parameters of the filter's model."""
-        model = law_of(filter.model).model
-        start = jax.tree.map(lambda leaf: leaf[:1], trajectory)
-        after = jax.tree.map(lambda leaf: leaf[1:], trajectory)
-
-        def log_likelihood(observation: PyTree, inputs: PyTree, state: PyTree) -> Float[Array, ""]:
-            one = jax.tree.map(lambda leaf: leaf[None], state)
-            return law_of(with_inputs(model, inputs)).log_likelihood(observation, one)[0]
-
-        seen = jax.vmap(log_likelihood)(self.series.observations, self.series.inputs, after)
-        if self.series.present is not None:
-            seen = jnp.where(self.series.present, seen, 0.0)
-        steps = jnp.sum(log_transitions(model, trajectory, self.series.inputs))
-        return model.log_initial(start)[0] + steps + jnp.sum(seen)
+    (paths, accepted, renewed), fields = sampling.run(kernel, {"observations": series}, functions)
+    return GibbsPosterior(trajectories=paths, accepted=accepted, renewed=renewed, **fields)
 
 
 class _Pair(eqx.Module):
@@ -201,12 +177,12 @@ class _Kernel(AbstractKernel):
         key_run, key_back = jax.random.split(key)
         filter, series = self.problem.at(reals), self.problem.objective.series
         run = scan(key_run, filter, series, None)
-        drawn = draw_trajectory(key_back, filter.model, run, series.inputs, self.backward)
+        path = draw_trajectory(key_back, filter.model, run, series.inputs, self.backward)
         fine = jnp.all(jnp.isfinite(run.log_likelihood_increments))
         if self.prior is not None:
             fine &= jnp.isfinite(self.prior(reals))
-        fine &= jnp.all(possible_times(filter.model, drawn, series.inputs))
-        return _Pair(reals, drawn), fine
+        fine &= jnp.all(possible_times(filter.model, path, series.inputs))
+        return _Pair(reals, path), fine
 
     def step(self, key: Key[Array, ""], state: _Pair, walk: RandomWalk) -> Step:
         """The next pair."""
@@ -215,22 +191,22 @@ class _Kernel(AbstractKernel):
         reals, accepted, invalid = move(key_parameters, state.reals, state.trajectory, walk)
         filter, before = self.problem.at(reals), state.trajectory
         series = self.problem.objective.series
-        found = renew(key_trajectory, filter, series, before, self.backward)
-        possible = possible_times(filter.model, found.trajectory, series.inputs)
-        broken = jnp.any(is_invalid(found.run.log_likelihood_increments))
-        broken |= ~jnp.all(found.possible & possible)
-        pair = chosen(~broken, _Pair(reals, found.trajectory), state)
+        result = renew(key_trajectory, filter, series, before, self.backward)
+        possible = possible_times(filter.model, result.trajectory, series.inputs)
+        broken = jnp.any(is_invalid(result.run.log_likelihood_increments))
+        broken |= ~jnp.all(result.possible & possible)
+        pair = chosen(~broken, _Pair(reals, result.trajectory), state)
         invalid["conditional_filter"] = broken
 
         def changed(new: Array, old: Array) -> Bool[Array, " times"]:
             return jnp.any((new != old).reshape(new.shape[0], -1), axis=1)
 
         changes = jax.tree.leaves(jax.tree.map(changed, pair.trajectory, before))
-        kept = pair.trajectory
+        path = pair.trajectory
         if self.collect is not None:
             with saying("collect", "called with a trajectory"):
-                kept = self.collect(kept)
-        report = (pair.reals, kept, accepted, jnp.any(jnp.stack(changes), axis=0))
+                path = self.collect(path)
+        report = (pair.reals, path, accepted, jnp.any(jnp.stack(changes), axis=0))
         return Step(pair, report, accepted, invalid)
 
     def _gibbs(

@@ -14,7 +14,7 @@ from mpfjax.checks import Count, CountOrZero, Rule, checked, shown, warn
 from mpfjax.filter import Filter
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.curvature import errors_at
-from mpfjax.tuning.evidence import names_but_proposals, pose_evidence, warn_of_bias
+from mpfjax.tuning.evidence import Score, names_but_proposals, pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import Objective, Parameters, Problem, Reals, Transforms, pose, scores
 
 Optimizer = Annotated[
@@ -66,21 +66,22 @@ def fit(
     num_seeds: Count = 8,
     batch: Count | None = None,
     pooled: bool | None = None,
+    score: Score = "filter",
     curvature_seeds: CountOrZero = 0,
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> TuningRun:
     """Maximise the log marginal likelihood over some of a filter's parameters.
 
-    Maximises, with the derivatives of the filter's moves, the sum over sequences s of
+    Maximises the sum over sequences s of
 
         log (1 / K Σ_k Ẑ_s(θ; k)),
 
     over K seeds k. Ẑ is unbiased, and the logarithm of its mean over seeds is biased far less than
     log Ẑ of one seed, which is below log Z by about half its variance. That variance depends on θ,
     and over many sequences its effect does not average out. Build the filter with
-    `gradient="stop"`: its derivatives estimate the score. With the default, "none", the
-    optimisation ends somewhere else, for any number of particles, and a warning is issued.
+    `gradient="stop"`, whose derivatives estimate the score, or use `score="fisher"`. With neither
+    the optimisation ends somewhere else, for any number of particles, and a warning is issued.
 
     The parameters of a proposal, such as a `NetworkProposal`, do not change Z. For them alone the
     mean over seeds of log Ẑ is maximised, a lower bound of log Z that a better proposal raises; the
@@ -100,6 +101,12 @@ def fit(
       Sequences in a batch have one shape. A `batch` that divides their number compiles once.
     - `pooled`: whether Ẑ or log Ẑ is averaged over seeds. None is as above: true unless all
       parameters are parameters of proposals.
+    - `score`: how the gradient is estimated. "filter" uses the derivatives of the filter's moves.
+      "fisher" draws a few trajectories backwards through each run, and uses the derivatives of
+      log p(x_0, ..., x_t, y_1, ..., y_t | θ) along them (Fisher's identity). It has less noise and
+      needs no derivative of draws or moves. The model needs `log_transition` and `log_initial` and
+      may not be conditionally linear, the parameters must be the model's, and every move must leave
+      each particle one parent.
     - `curvature_seeds`: the seeds for `standard_errors` at the end, in whole batches of
       `num_seeds`; 0 for none.
     - `checkpoint`: a `Checkpoint`, from whose file the same call continues, also to a larger
@@ -112,18 +119,19 @@ def fit(
     If the log marginal likelihood or the gradient is not finite, the optimisation ends with the
     last good parameters, a warning, and the step in `stopped`. Ctrl-C ends it with a warning as
     well. Raises `ValueError` for a parameter that is not a floating-point number, is static, starts
-    outside its domain or has no effect. Raises it for a checkpoint of another fit, naming the
-    difference, for one that is truncated or lacks an array, and as `run_filter` does. Raises
-    `RuntimeError` if the initial value is not finite.
+    outside its domain or has no effect, and for "fisher" if one of its requirements is missing.
+    Raises it for a checkpoint of another fit, naming the difference, for one that is truncated or
+    lacks an array, and as `run_filter` does. Raises `RuntimeError` if the initial value is not
+    finite.
     """
-    problem = pose_evidence(filter, observations, parameters, transforms)
+    problem = pose_evidence(filter, observations, parameters, transforms, score)
     warn_of_bias("fit", problem)
     if pooled is None:
         pooled = bool(names_but_proposals(problem))
     ascent = _Ascent(
-        "fit", "log_marginal_likelihood", key, problem, optimizer, num_seeds, batch, pooled
+        "fit", "log marginal likelihood", key, problem, optimizer, num_seeds, batch, pooled
     )
-    data = {"observations": problem.objective}
+    data = {"observations": problem.objective, "score": score}
     reals, values, run = ascent.climb(num_steps, checkpoint, progress, data, {})
     if pooled:
         _warn_of_few_seeds(run[3]["effective_seeds"], values)
@@ -151,8 +159,8 @@ def _warn_of_few_seeds(history: np.ndarray, values: np.ndarray | None) -> None:
     if effective < _FEWEST_SEEDS and values is not None:
         spread = values.std(axis=0, ddof=1).mean() if len(values) > 1 else np.nan
         of = f", since log Ẑ has a standard deviation of {spread:.1f}" if len(values) > 1 else ""
-        said = f"only {effective:.1f} of {len(values)} seeds count for a series{of}, and the"
-        warn(f"fit: {said} parameters are biased; raise num_particles or num_seeds", UserWarning)
+        what = f"only {effective:.1f} of {len(values)} seeds count for a series{of}, and the"
+        warn(f"fit: {what} parameters are biased; raise num_particles or num_seeds", UserWarning)
 
 
 @checked
@@ -186,9 +194,9 @@ def maximise(
     """
     problem = pose(model, objective, parameters, transforms)
     ascent = _Ascent("maximise", "value", key, problem, optimizer, num_seeds)
-    found = eqx.filter_eval_shape(objective, key, problem.at(problem.start()))
-    if getattr(found, "shape", None) != () or not jnp.issubdtype(found.dtype, jnp.floating):
-        raise ValueError(f"objective: it returns {shown(found)}, no floating point scalar")
+    value = eqx.filter_eval_shape(objective, key, problem.at(problem.start()))
+    if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.floating):
+        raise ValueError(f"objective: it returns {shown(value)}, no floating point scalar")
     functions = {"objective": (problem.value, key, problem.start())}
     data = {"objective": objective}
     _, _, run = ascent.climb(num_steps, checkpoint, progress, data, functions)
@@ -231,12 +239,12 @@ class _Ascent:
         functions |= {"optimizer": (first, reals)}
         identity = identity_of(self.caller, checkpoint, settings, functions)
         run = LongRun(self.caller, num_steps, checkpoint, progress, lambda step: identity)
-        state, stopped = run.go(start, lambda: start, self._advance)
+        state, stopped = run.go(start, self._advance)
         (reals, _), (averages, deviations, effective, path) = state.carry, state.rows
         key = jax.random.fold_in(self.key, state.step)
         try:
             values = np.concatenate([
-                self._evaluated(jax.random.fold_in(key, number) if number else key, part, reals)[0]
+                self._evaluated(jax.random.fold_in(key, number), part, reals)[0]
                 for number, part in enumerate(self.parts())
             ], axis=1)  # fmt: skip
             value = self._average(values)
@@ -285,10 +293,10 @@ class _Ascent:
         """The objective of each seed, and the gradient of their average; `Broken` if not finite."""
         keys = jax.random.split(key, self.num_seeds)
         values, gradient = scores(keys, problem, reals, self.pooled)
-        values, named = np.asarray(values, float), self.objective.replace("_", " ")
+        values = np.asarray(values, float)
         broken = [name for name, leaf in gradient.items() if not np.isfinite(leaf).all()]
         if not np.isfinite(values).all():
-            raise Broken(f"the {named} was {values.mean()}")
+            raise Broken(f"the {self.objective} was {values.mean()}")
         if broken:
             raise Broken(f"the gradient of {', '.join(broken)} was not finite")
         return values, gradient
@@ -300,8 +308,8 @@ class _Ascent:
         values, gradient = self._evaluated(jax.random.fold_in(self.key, step), problem, reals)
         idle = [name for name, leaf in gradient.items() if not np.asarray(leaf).any()]
         if step == 0 and idle:
-            named = self.objective.replace("_", " ")
-            raise ValueError(f"parameters: the {named} does not depend on {', '.join(idle)}")
+            what = f"the {self.objective} does not depend on {', '.join(idle)}"
+            raise ValueError(f"parameters: {what}")
         gradient = jax.tree.map(lambda leaf: factor * leaf, gradient)
         updated, optimizer = self._updated(gradient, optimizer, reals)
         deviation = np.sqrt(factor) * values.sum(axis=1).std()

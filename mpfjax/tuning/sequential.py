@@ -1,15 +1,14 @@
 """The posterior of parameters as observations come in, by SMC²."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count, checked, kinds
+from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import Series
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.chains import warn_of_invalid
@@ -45,16 +44,16 @@ class SequentialPosterior:
     num_invalid: dict[str, int]
     """how often `log_prior` or `log_marginal_likelihood` was NaN or +inf: of θs that were dropped,
     and of proposals that were rejected."""
-    stopped: str | None = None
+    stopped: str | None
     """why it ended before the last observation, or None."""
-    problem: Problem | None = field(default=None, repr=False, compare=False)
-    """what was sampled: the filter, its parameters and the observations."""
-    families: Int[np.ndarray, " samples"] = field(default_factory=lambda: np.zeros(0, int))
-    """from which draw of the prior each sample descends."""
-    mixtures: Any = field(default=None, repr=False, compare=False)
-    """of each sample's own filter, after the last observation."""
-    _goes_on: "tuple[_Run, State] | None" = field(default=None, repr=False, compare=False)
+    _end: "tuple[_Run, State]" = field(compare=False)
     """what `extend` starts from."""
+
+    @property
+    def problem(self) -> Problem:
+        """What was sampled: the filter with its last N, and its parameters."""
+        run, state = self._end
+        return run.sampler.with_particles(state.carry[2]).problem
 
     @property
     def log_marginal_likelihood(self) -> float:
@@ -75,8 +74,8 @@ class SequentialPosterior:
         uncertainty of about 1 / sqrt(2 f). If fewer than ten are left, use more samples, or several
         runs in `compare_evidence`.
         """
-        run, _ = cast(tuple[_Run, State], self._goes_on)
-        shares = np.bincount(self.families, self.weights.astype(float))
+        run, state = self._end
+        shares = np.bincount(state.carry[1], self.weights.astype(float))
         num, num_moves = len(self.weights), run.sampler.num_moves
         num_chains = num // (num_moves + 1)
         if np.count_nonzero(shares) < _FEWEST_FAMILIES:
@@ -96,13 +95,12 @@ class SequentialPosterior:
         return np.asarray(np.einsum("n,n...->...", self.weights, self.parameters[name]))
 
     @property
-    def filters(self) -> tuple[Problem, Series, Float[np.ndarray, " samples"]]:
-        """The problem with the filters' N, the data processed so far, and log Ẑ of each."""
-        run, state = cast(tuple[_Run, State], self._goes_on)
-        samples, _, num_particles, _ = state.carry
-        seen = jax.tree.map(lambda leaf: leaf[: state.step], run.series)
-        problem = run.sampler.with_particles(num_particles).problem
-        return problem, seen, np.asarray(samples.particles.log_likelihood)
+    def filters(self) -> tuple[Series, ParticleMixture, Float[np.ndarray, " samples"]]:
+        """The observations so far, and the mixture and log Ẑ of each sample's filter."""
+        run, state = self._end
+        points = state.carry[0].particles
+        series = jax.tree.map(lambda leaf: leaf[: state.step], run.series)
+        return series, points.mixture, np.asarray(points.log_likelihood)
 
     def resampled(self, rows: PyTree) -> PyTree:
         """The rows of as many samples of equal weight (systematic), as of one chain: (1, n, ...).
@@ -142,7 +140,7 @@ class SequentialPosterior:
         This posterior does not change. Raises `ValueError` for observations of other shapes or
         types, and as `smc2` does. Use it as observations arrive.
         """
-        run, state = cast(tuple[_Run, State], self._goes_on)
+        run, state = self._end
         return run.followed_by(state.step, observations, progress).posterior(state)
 
 
@@ -220,7 +218,11 @@ def smc2(
     }  # fmt: skip
     identity = identity_of("smc2", checkpoint, settings, {"log_prior": (prior, first)})
     run = _Run(sampler, series, key_steps, max_particles, checkpoint, progress, identity)
-    return run.posterior(None, jax.random.split(key_filters, num_samples), reals)
+    samples = started(jax.random.split(key_filters, num_samples), sampler, reals)
+    num_invalid = {"log_prior": 0, "log_marginal_likelihood": 0}
+    carry = samples, np.arange(num_samples), problem.tree.num_particles, num_invalid
+    rows = np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64)
+    return run.posterior(State(0, carry, rows))
 
 
 @dataclass(frozen=True)
@@ -254,50 +256,33 @@ class _Run:
         if there != here:
             raise ValueError(f"observations: {here} is not like those before, {there}")
         series = jax.tree.map(lambda *leaves: np.concatenate(leaves), before, after)
-        held = self.sampler.series.length
+        capacity = self.sampler.series.length
         # With room for as many more, so that observations that come one by one share a program.
-        capacity = held if series.length <= held else max(series.length, 2 * held)
+        if series.length > capacity:
+            capacity = max(series.length, 2 * capacity)
         sampler = replace(self.sampler, series=_padded(series, capacity))
         return replace(self, sampler=sampler, series=series, progress=progress)
 
-    def posterior(
-        self, state: State | None, keys: Key[Array, " n"] | None = None, reals: Any = None
-    ) -> SequentialPosterior:
-        """The posterior after all observations, from a state on, or from draws of the prior."""
+    def posterior(self, start: State) -> SequentialPosterior:
+        """The posterior after all observations, from a state on."""
 
         def identity(step: int) -> dict[str, str]:
-            seen = jax.tree.map(lambda leaf: leaf[:step], self.series)
-            data = {"observations": with_present(seen)}
+            before = jax.tree.map(lambda leaf: leaf[:step], self.series)
+            data = {"observations": with_present(before)}
             return self.identity | identity_of("smc2", self.checkpoint, data, {})
 
-        def start() -> State:
-            return like._replace(carry=(started(keys, self.sampler, reals), *like.carry[1:]))
-
         run = LongRun("smc2", self.series.length, self.checkpoint, self.progress, identity)
-        before = {"log_prior": 0, "log_marginal_likelihood": 0}
-        if state is None:
-            samples = eqx.filter_eval_shape(started, keys, self.sampler, reals)
-            rows = (np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
-            num_particles = self.sampler.problem.tree.num_particles
-            num = samples.particles.log_prior.shape[0]
-            like = State(0, (samples, np.arange(num), num_particles, before), rows)
-            state, stopped = run.go(like, start, self._advance)
-        else:
-            before = state.carry[-1]
-            state, stopped = run.go_on(state, self._advance)
-        samples, families, _, num_invalid = state.carry
-        new = {name: count - before[name] for name, count in num_invalid.items()}
-        warn_of_invalid("smc2", new)
+        state, stopped = run.go(start, self._advance)
+        samples, *_, num_invalid = state.carry
+        before = start.carry[-1]
+        warn_of_invalid("smc2", {name: num_invalid[name] - before[name] for name in before})
         return SequentialPosterior(
             self.sampler.problem.constrained_rows(samples.particles.reals),
             np.asarray(samples.log_weights),
             *state.rows,
             num_invalid=num_invalid,
             stopped=stopped,
-            problem=self.sampler.problem,
-            families=families,
-            mixtures=samples.particles.mixture,
-            _goes_on=(self, state),
+            _end=(self, state),
         )
 
     def _advance(self, step: int, last: int, carry: PyTree) -> tuple[int, PyTree, PyTree]:

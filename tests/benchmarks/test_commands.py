@@ -21,7 +21,9 @@ COMMANDS = {
     "gm_mpf": "gm_mpf.json particle_migration.png effective_sample_size.png",
     "hand_written_c": "hand_written_c.json",
     "interacting_objects": "interacting_objects.json interacting_objects.png",
-    "likelihood_tuning": "scores.json gradients.json shifts.json learned.json many_dimensions.json",
+    "likelihood_tuning": (
+        "scores.json gradients.json shifts.json learned.json coverage.json many_dimensions.json"
+    ),
     "localisation": "localisation.json recovery.png",
     "marginalised": "marginalised.json",
     "masses": "masses.json masses.png",

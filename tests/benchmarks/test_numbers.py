@@ -1,23 +1,14 @@
 """What commands compute beside filters: against exact answers, and counted by hand."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from benchmarks.coverage import coverage, covers
-from benchmarks.likelihood_tuning.soft_colours import SoftColourModel, soft_histograms
 from benchmarks.localisation.filters import AdaptiveMonteCarlo
 from benchmarks.masses.scenes import SCENES
 from benchmarks.partitioned_sampling.posterior import distance_maps
-from mpfjax.vision.boxes.colour_model import BoxState
-from mpfjax.vision.colour.bins import RGBColours
-from mpfjax.vision.colour.histograms import integral_histogram
-from tests.precision import float64
-
-NOISE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
 
 
 @pytest.mark.exactness
@@ -69,44 +60,6 @@ def test_maps_are_counted_pixel_by_pixel():
             expected += 1 - np.sqrt(shares * references[0, part]).sum()
         place = found[top + sides[1], left + sides[0]]
         assert place == pytest.approx(expected, abs=1e-5)
-
-
-# --- colours and boxes --------------------------------------------------------------------------
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize(("num_bins", "num_parts"), [(16, 1), (30, 4)])
-def test_the_limit_of_soft_histograms_is_the_hard_one(num_bins, num_parts):
-    """With a point on every pixel, on noise, where no blur would go unseen."""
-    boxes = jnp.array([[20.0, 20, 12, 12], [31, 15, 12, 12], [54, 34, 12, 12]])
-    hard = integral_histogram(jnp.asarray(NOISE), RGBColours(num_bins)).counts(boxes, num_parts)
-    sharp = jnp.array(1e-3)
-    soft = soft_histograms(jnp.asarray(NOISE), boxes, num_bins, sharp, 12, num_parts)
-    np.testing.assert_allclose(soft * 144 / num_parts, hard, atol=1e-3)
-
-
-@pytest.mark.exactness
-def test_derivatives_of_the_soft_model_are_those_of_differences():
-    boxes = np.array([[10.0, 8, 12, 16], [35, 12, 12, 20]])
-    model = SoftColourModel.from_frame(NOISE, boxes, num_bins=8, num_points=4, num_parts=2)
-    box = jnp.array([[17.3, 16.6, 1.1, 0.9], [39.1, 21.2, 0.9, 1.0]])
-
-    @jax.jit
-    def total(logits, lambda_, bandwidth, box):
-
-        def names(m):
-            return (m.reference_logits, m.lambda_, m.bandwidth)
-
-        changed = eqx.tree_at(names, model, (logits, lambda_, bandwidth))
-        state = BoxState(box, jnp.arange(2, dtype=jnp.int32))
-        return jnp.sum(changed.log_likelihood(jnp.asarray(NOISE), state))
-
-    with float64(), jax.numpy_dtype_promotion("standard"):
-        model = jax.tree.map(lambda leaf: leaf.astype(float), model)
-        logits = model.reference_logits
-        logits = logits + 0.3 * jax.random.normal(jax.random.key(1), logits.shape)
-        given = (logits, model.lambda_, model.bandwidth, box.astype(float))
-        check_grads(total, given, order=1, modes=["rev"], eps=1e-6, rtol=1e-3)
 
 
 # --- scores of tracks, and detections -----------------------------------------------------------

@@ -217,15 +217,14 @@ class TestLongRuns:
         identity = identity_of("adding", checkpoint, {"start": 0} | settings, {})
         run = LongRun("adding", last, checkpoint, False, lambda step: identity)
 
-        def start():
-            return State(0, np.array(0), np.zeros(0, int))
+        start = State(0, np.array(0), np.zeros(0, int))
 
         def advance(step, last, total):
             if step == stop:
                 raise error
             return step + 1, total + step + 1, total[None] + step + 1
 
-        state, stopped = run.go(start(), start, advance)
+        state, stopped = run.go(start, advance)
         assert state.step == len(state.rows)
         return state.rows.tolist(), stopped
 

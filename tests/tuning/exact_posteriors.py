@@ -95,21 +95,25 @@ def _summary(grid, log_densities):
     return Exact(mean, density @ (grid - mean) ** 2, log_evidence)
 
 
+def log_evidence_of(model):
+    """By a scalar Kalman filter, in which a missing observation is none."""
+    mean, variance, total = model.m, model.p**2, 0.0
+    for y, u in zip(np.asarray(OBSERVATIONS), np.asarray(INPUTS), strict=True):
+        mean, variance = model.a * mean + u, model.a**2 * variance + model.q**2
+        if np.isfinite(y):
+            innovation = variance + model.r**2
+            total += norm.logpdf(y, mean, jnp.sqrt(innovation))
+            gain = variance / innovation
+            mean, variance = mean + gain * (y - mean), (1 - gain) * variance
+    return total
+
+
 @cache
 def posterior_of_a(low=-1.7, high=2.3, r=0.5):
-    """By a scalar Kalman filter, in which a missing observation is none; of a in an interval."""
+    """Of a in an interval."""
 
     def log_density(a):
-        model = ScalarLinear(a=a, r=r)
-        mean, variance, total = model.m, model.p**2, log_prior_of_a({"a": a})
-        for y, u in zip(np.asarray(OBSERVATIONS), np.asarray(INPUTS), strict=True):
-            mean, variance = a * mean + u, a**2 * variance + model.q**2
-            if np.isfinite(y):
-                innovation = variance + model.r**2
-                total += norm.logpdf(y, mean, jnp.sqrt(innovation))
-                gain = variance / innovation
-                mean, variance = mean + gain * (y - mean), (1 - gain) * variance
-        return total
+        return log_prior_of_a({"a": a}) + log_evidence_of(ScalarLinear(a=a, r=r))
 
     grid = jnp.linspace(low, high, 402)[1::2]
     return _summary(grid, jax.jit(jax.vmap(log_density))(grid))

@@ -12,7 +12,8 @@ from mpfjax.tuning.evidence import pose_evidence
 from mpfjax.tuning.problem import scores
 from tests.marking import exactness
 from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, in_matrices
-from tests.user_models import TwoSensors
+from tests.tuning.exact_posteriors import SERIES, Pushed, eager_mixture, log_evidence_of
+from tests.user_models import ScalarLinear, TwoSensors
 
 SEEN = np.array([[1.0, np.nan], [0.7, 0.3], [np.nan, 0.9], [np.nan, np.nan], [0.4, -0.2]])
 KEY, GAIN = jax.random.key(0), {"gain": lambda filter: filter.model.gain}
@@ -52,3 +53,50 @@ def test_the_score_of_a_controls_coefficient_is_that_of_kalmans_filter():
         standard = errors.std() / np.sqrt(len(errors))
         assert 0 < standard < 0.3
         assert abs(errors.mean()) < 4 * standard
+
+
+@pytest.mark.parametrize("name", ["particle filter", *exactness(["mixture"])])
+def test_the_score_by_fishers_identity_is_exact_without_any_gradient_of_the_moves(name):
+    """Times Ẑ it is unbiased: in x_0, steps and observations, with inputs and a missing y."""
+    names = "amqr"
+    filter = mpfjax.particle_filter(Pushed(), 20)
+    if name == "mixture":
+        filter = eager_mixture(20).replace(model=Pushed())
+    parameters = {n: lambda filter, n=n: getattr(filter.model, n) for n in names}
+    problem = pose_evidence(filter, SERIES, parameters, None, "fisher")
+
+    @jax.jit
+    def value_and_score(key):
+        return jax.value_and_grad(problem.value, argnums=1)(key, problem.start())
+
+    values, slopes = jax.vmap(value_and_score)(jax.random.split(KEY, 2000))
+    start = {n: getattr(Pushed(), n) for n in names}
+    exact = jax.value_and_grad(lambda reals: log_evidence_of(ScalarLinear(**reals)))
+    value, slope = exact(start)
+    ratios = np.exp(np.asarray(values, float) - float(value))
+    for n in names:
+        errors = ratios * (np.asarray(slopes[n], float) - float(slope[n]))
+        standard = errors.std() / np.sqrt(len(errors))
+        assert 0 < standard < 0.1
+        assert abs(errors.mean()) < 4 * standard, n
+
+
+@pytest.mark.parametrize(
+    ("filter", "says"),
+    [
+        (lambda: mpfjax.particle_filter(ScalarLinear(), 4), "no log_initial, which score="),
+        (lambda: mpfjax.gaussian_particle_filter(Pushed(), 4), "GaussianRegeneration leaves no"),
+        (lambda: mpfjax.with_restarts(mpfjax.particle_filter(Pushed(), 4)), "filter: .* leaves no"),
+    ],
+)
+def test_fishers_identity_needs_parents_and_the_density_of_the_start(filter, says):
+    with pytest.raises(ValueError, match=says):
+        pose_evidence(filter(), SERIES, None, None, "fisher")
+
+
+def test_parameters_of_a_proposal_have_no_score_by_fishers_identity():
+    proposal = mpfjax.NetworkProposal.create(KEY, 1, 1, 0.8)
+    filter = mpfjax.particle_filter(Pushed(), 4, proposal=proposal)
+    parameters = {"w": lambda filter: filter.moves[1].proposal.network}
+    with pytest.raises(ValueError, match=r'score: "fisher" has no derivative in .* proposal'):
+        pose_evidence(filter, SERIES, parameters, None, "fisher")

@@ -25,7 +25,14 @@ NOISE = {"r": lambda filter: filter.model.r}
 ADAM = optax.adam(0.05)
 
 
-class Fragile(ScalarLinear):
+class Normal(ScalarLinear):
+    """With the density of x_0."""
+
+    def log_initial(self, states):
+        return norm.logpdf(states, self.m, self.p)
+
+
+class Fragile(Normal):
     """A likelihood that breaks where its deviation falls below 0.3, and a parameter to no end."""
 
     idle: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
@@ -55,7 +62,8 @@ def series_of(length, rng):
 
 
 @pytest.mark.weekly
-def test_the_maximum_is_found_with_its_standard_errors():
+@pytest.mark.parametrize(("gradient", "score"), [("stop", "filter"), ("none", "fisher")])
+def test_the_maximum_is_found_with_its_standard_errors(gradient, score):
     """On a linear-Gaussian model, whose likelihood the Kalman filter gives."""
     rng = np.random.default_rng(0)
     sequences = [series_of(length, rng) for length in (30, 20)]
@@ -73,11 +81,11 @@ def test_the_maximum_is_found_with_its_standard_errors():
     exact_error = np.sqrt(np.diag(np.linalg.inv(-hessian)))
     run = fit(
         jax.random.key(1),
-        mpfjax.particle_filter(ScalarLinear(a=0.3, r=1.5), 100, gradient="stop"),
+        mpfjax.particle_filter(Normal(a=0.3, r=1.5), 100, gradient=gradient),
         sequences, optax.sgd(optax.cosine_decay_schedule(0.06, 50)), 50,
         parameters={n: lambda filter, n=n: getattr(filter.model, n) for n in ("a", "r")},
         transforms={"a": Interval(-1.0, 1.0), "r": Positive()},
-        num_seeds=8, curvature_seeds=64, progress=False,
+        num_seeds=8, curvature_seeds=64, score=score, progress=False,
     )  # fmt: skip
     a, r = 2 / (1 + np.exp(-float(best[0]))) - 1, np.exp(float(best[1]))
     slope = np.array([(1 - a**2) / 2, r])
@@ -206,6 +214,7 @@ class TestResuming:
         ("other", "named"),
         [
             ({"num_seeds": 2}, "num_seeds is 4 there and 2 here"),
+            ({"score": "fisher"}, "score is filter there and fisher here"),
             ({"start": {"r": 0.7}}, r"filter\.model\.r is .* 0\.5 there and .* 0\.7 here"),
             ({"start": {"q": 0.7}}, r"filter\.model\.q is"),
             ({"start": {"num_particles": 8}}, r"filter\.num_particles is 16 there and 8 here"),
@@ -225,12 +234,16 @@ class TestResuming:
         ):
             short_fit(checkpoint=Checkpoint(tmp_path / "fit.npz"), **other)
 
-    @pytest.mark.parametrize(("num_steps", "step", "last"), [(6, 0.2, 3), (1, 1.0, 1)])
+    @pytest.mark.parametrize(
+        ("num_steps", "step", "last", "score"),
+        [(6, 0.2, 3, "filter"), (1, 1.0, 1, "filter"), (6, 0.2, 3, "fisher")],
+    )
     def test_a_fit_that_broke_has_the_last_good_parameters_and_stays(
-        self, tmp_path, num_steps, step, last
+        self, tmp_path, num_steps, step, last, score
     ):
         """In the middle, or where its end was evaluated."""
         options = {"optimizer": falling(step), "checkpoint": Checkpoint(tmp_path / "fit.npz")}
+        options["score"] = score
         with pytest.warns(UserWarning, match=f"was nan at step {last}"):
             first = short_fit(num_steps, **options)
         assert first.stopped == f"the log marginal likelihood was nan at step {last}"

@@ -1,4 +1,4 @@
-"""Past states over the posterior of parameters and states: whole trajectories, or their ends."""
+"""States and observations over the posterior of the parameters: of the past, and to come."""
 
 from dataclasses import replace
 from functools import partial
@@ -11,9 +11,10 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, checked
 from mpfjax.filter import check_keep_parents
-from mpfjax.models.base import with_inputs
+from mpfjax.models.base import require, with_inputs
 from mpfjax.models.law import refuse_marginalised
-from mpfjax.models.observations import Series
+from mpfjax.models.observations import Series, steps_of_inputs
+from mpfjax.models.simulation import steps_ahead
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.smoothing.backward import draw
 from mpfjax.smoothing.conditional import draw_trajectory, shape_of_trajectory
@@ -41,6 +42,15 @@ class PosteriorTrajectories(NamedTuple):
     None of a model without `sample_observation`."""
     observed: Series
     """y_1, ..., y_t, as the sampler was given them."""
+
+
+class Predictive(NamedTuple):
+    """Draws of future states and observations, all of equal weight."""
+
+    states: PyTree
+    """x_{t+1}, ..., x_{t+k}, leaves (chains, draws, k, ...)."""
+    observations: PyTree
+    """y_{t+1}, ..., y_{t+k}, leaves (chains, draws, k, ...)."""
 
 
 @checked
@@ -71,52 +81,97 @@ def posterior_trajectories(
     a conditionally linear model. Use it for the past with its uncertainty; `sample_trajectories` is
     for known parameters, and `posterior_predictive` for the future.
     """
-    key_paths, key_seen = jax.random.split(key)
-    problem, values, paths = drawn_states(key_paths, posterior, num_trajectories, whole=True)
-    series, seen = _series_of(posterior), None
+    key_paths, key_observations = jax.random.split(key)
+    states = states_of(key_paths, posterior, num_trajectories, whole=True)
+    (problem, series, values, paths), replicates = states, None
     if callable(getattr(problem.tree.model, "sample_observation", None)):
-        keys = jax.random.split(key_seen, jax.tree.leaves(paths)[0].shape[:2])
-        seen = _in_numpy(_observe(problem, series.inputs, keys, values, paths))
-    return PosteriorTrajectories(values, paths, seen, series)
+        keys = jax.random.split(key_observations, jax.tree.leaves(paths)[0].shape[:2])
+        replicates = _in_numpy(_observe(problem, series.inputs, keys, values, paths))
+    return PosteriorTrajectories(values, paths, replicates, series)
 
 
-def drawn_states(
+@checked
+def posterior_predictive(
+    key: Key[Array, ""],
+    posterior: Chains,
+    num_steps: Count,
+    *,
+    num_trajectories: Count | None = None,
+    inputs: PyTree = None,
+) -> Predictive:
+    """Draw the next k states and observations, with parameters and states integrated out.
+
+    For each draw of θ there is one of x_t given θ, then the model's own steps and observations:
+
+        p(y_{t+1}, ..., y_{t+k} | y_1..y_t)
+            = ∫ p(θ, x_t | y_1..y_t) p(x_{t+1}, y_{t+1}, ..., x_{t+k}, y_{t+k} | θ, x_t).
+
+    The pair (θ, x_t) has the posterior distribution as exactly as θ alone, for any N:
+
+    - for `metropolis_hastings`, x_t is a particle of the run whose Ẑ was accepted (Andrieu, Doucet
+      and Holenstein 2010, section 2.4.2), which is repeated with its key, once for all draws that
+      share it;
+    - for `particle_gibbs`, the end of the trajectory, which must be stored completely
+      (`collect=None`);
+    - for `smc2`, a particle of the sample's own filter. There are as many draws as samples, as one
+      chain, resampled by their weights.
+
+    - `num_trajectories`, as for `posterior_trajectories`: a few hundred of each chain are enough
+      for bands, and for `metropolis_hastings` each requires a run of the filter.
+    - `inputs`: u_{t+1}, ..., u_{t+k}, as for `run_filter`.
+
+    Raises `ValueError` for a model without `sample_observation(key, states)`, for trajectories that
+    were not stored, and for a posterior of several sequences. Use it for forecasts that include all
+    uncertainty; `forecast` is for known parameters, and `posterior_trajectories` for the past.
+    """
+    problem: Any = posterior.problem
+    model = problem.tree.model
+    require(model, "sample_observation", "posterior_predictive")
+    inputs = steps_of_inputs(inputs, num_steps, model, "steps")
+    key_ends, key_steps = jax.random.split(key)
+    problem, _, values, ends = states_of(key_ends, posterior, num_trajectories, whole=False)
+    keys = jax.random.split(key_steps, jax.tree.leaves(ends)[0].shape[:2])
+    return Predictive(*_in_numpy(_predict(problem, keys, values, ends, num_steps, inputs)))
+
+
+def states_of(
     key: Key[Array, ""], posterior: Any, number: int | None, whole: bool
-) -> tuple[Any, dict[str, np.ndarray], PyTree]:
-    """The problem, parameters, and a trajectory for each, or x_t alone: (chains, draws, ...)."""
+) -> tuple[Any, Series, dict[str, np.ndarray], PyTree]:
+    """The problem, its data, parameters, and a trajectory or x_t for each: (chains, draws, ...)."""
     problem, values = posterior.problem, posterior.parameters
     if isinstance(posterior, GibbsPosterior):
-        kept = posterior.trajectories
-        if {leaf.shape[2:3] for leaf in jax.tree.leaves(kept)} != {posterior.renewed.shape[2:]}:
+        paths = posterior.trajectories
+        if {leaf.shape[2:3] for leaf in jax.tree.leaves(paths)} != {posterior.renewed.shape[2:]}:
             raise ValueError("posterior: its trajectories are not whole, as by collect=None")
-        values, kept = _thinned((values, kept), number)
-        return problem, values, kept if whole else jax.tree.map(lambda leaf: leaf[:, :, -1], kept)
+        paths = paths if whole else jax.tree.map(lambda leaf: leaf[:, :, -1], paths)
+        return problem, problem.objective.series, *_thin((values, paths), number)
     if isinstance(posterior, SequentialPosterior):
-        problem, series, log_likelihoods = posterior.filters
+        series, mixtures, log_likelihoods = posterior.filters
         evidence = LogEvidence([jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], series)])
         if not whole:
-            rows = posterior.resampled((values, posterior.mixtures))
-            values, mixtures = _thinned(rows, number)
+            values, mixtures = _thin(posterior.resampled((values, mixtures)), number)
             keys = jax.random.split(key, mixtures.log_weights.shape[:2])
-            return problem, values, _in_numpy(_of_mixtures(keys, mixtures))
+            return problem, series, values, _in_numpy(_of_mixtures(keys, mixtures))
         keys = jax.random.split(key, (2, len(log_likelihoods)))
         paths, new = _run_again(problem, evidence, (keys[0], values, keys[1]), whole)
         gains = np.where(np.isfinite(log_likelihoods), new - log_likelihoods, -np.inf)
         log_weights = posterior.log_weights + gains
         log_weights -= np.logaddexp.reduce(log_weights)
-        weighed = replace(posterior, log_weights=log_weights)
-        return problem, *_thinned(weighed.resampled((values, paths)), number)
-    if [group.length for group in problem.objective.groups] != [1]:
+        posterior = replace(posterior, log_weights=log_weights)
+        return problem, series, *_thin(posterior.resampled((values, paths)), number)
+    evidence = problem.objective
+    if [group.length for group in evidence.groups] != [1]:
         raise ValueError("posterior: it is given several sequences, each with its own states")
-    values, key_data = _thinned((values, posterior.key_data), number)
+    series = jax.tree.map(lambda leaf: leaf[0], evidence.groups[0])
+    values, key_data = _thin((values, posterior.key_data), number)
     # Steps that were rejected have the run of the step before, and its trajectory.
     flat, shape = _in_one_row(key_data), key_data.shape[:2]
     _, first, place = np.unique(flat, axis=0, return_index=True, return_inverse=True)
-    rows = _taken(jax.tree.map(_in_one_row, values), first)
+    rows = _rows_of(jax.tree.map(_in_one_row, values), first)
     keys = jax.random.wrap_key_data(jnp.asarray(flat[first]), impl=jax.random.key_impl(key))
-    own = jax.random.split(key, len(first))
-    paths, _ = _run_again(problem, problem.objective, (own, rows, keys), whole)
-    return problem, values, _taken(paths, place.reshape(shape))
+    keys_states = jax.random.split(key, len(first))
+    paths, _ = _run_again(problem, evidence, (keys_states, rows, keys), whole)
+    return problem, series, values, _rows_of(paths, place.reshape(shape))
 
 
 def _in_numpy(tree: PyTree) -> PyTree:
@@ -124,16 +179,7 @@ def _in_numpy(tree: PyTree) -> PyTree:
     return jax.tree.map(np.asarray, tree)
 
 
-def _series_of(posterior: Any) -> Series:
-    if isinstance(posterior, SequentialPosterior):
-        return posterior.filters[1]
-    objective = posterior.problem.objective
-    if isinstance(posterior, GibbsPosterior):
-        return objective.series
-    return jax.tree.map(lambda leaf: leaf[0], objective.groups[0])
-
-
-def _taken(rows: PyTree, places: np.ndarray) -> PyTree:
+def _rows_of(rows: PyTree, places: np.ndarray) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[places], rows)
 
 
@@ -142,13 +188,13 @@ def _in_one_row(leaf: Any) -> Any:
     return leaf.reshape(-1, *leaf.shape[2:])
 
 
-def _thinned(rows: PyTree, number: int | None) -> PyTree:
+def _thin(rows: PyTree, number: int | None) -> PyTree:
     """So many draws of each chain, evenly spaced, or all where there are no more."""
     length = jax.tree.leaves(rows)[0].shape[1]
     if number is None or number >= length:
         return rows
-    chosen = (np.arange(number) + 1) * length // number - 1
-    return jax.tree.map(lambda leaf: leaf[:, chosen], rows)
+    places = (np.arange(number) + 1) * length // number - 1
+    return jax.tree.map(lambda leaf: leaf[:, places], rows)
 
 
 def _run_again(
@@ -172,7 +218,7 @@ def _run_again(
     # Whole batches, so that one program does for any number of rows: compiling takes the time.
     number, parts = rows[0].shape[0], []
     for first in range(0, number, size):
-        batch = _taken(rows, np.arange(first, first + size) % number)
+        batch = _rows_of(rows, np.arange(first, first + size) % number)
         parts.append(_in_numpy(_runs_again(problem, evidence, batch, whole, backward)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *parts)
 
@@ -214,11 +260,21 @@ def _observe(problem, inputs, keys, values, paths):
         after = jax.tree.map(lambda leaf: leaf[1:], path)
         keys = jax.random.split(key, jax.tree.leaves(after)[0].shape[0])
 
-        def seen(key: Array, now: PyTree, state: PyTree) -> PyTree:
+        def observe(key: Array, now: PyTree, state: PyTree) -> PyTree:
             alone = jax.tree.map(lambda leaf: leaf[None], state)
             observation = with_inputs(model, now).sample_observation(key, alone)
             return jax.tree.map(lambda leaf: leaf[0], observation)
 
-        return jax.vmap(seen)(keys, inputs, after)
+        return jax.vmap(observe)(keys, inputs, after)
 
     return jax.vmap(jax.vmap(one))(keys, values, paths)
+
+
+# Compiling takes nearly all of the time.
+@partial(jit_on_wide_vectors, soon=True)
+def _predict(problem, keys, values, ends, num_steps, inputs):
+    def one(key: Array, values: PyTree, end: PyTree) -> tuple[PyTree, PyTree]:
+        state = jax.tree.map(lambda leaf: leaf[None], end)
+        return steps_ahead(key, problem.having(values).model, state, num_steps, inputs)
+
+    return jax.vmap(jax.vmap(one))(keys, values, ends)
