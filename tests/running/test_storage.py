@@ -109,7 +109,7 @@ class TestRoundTrip:
     )
     def test_another_state_is_refused_by_what_differs(self, path, other, named):
         mpfjax.save_checkpoint(path, MIXTURE if "key" not in named else jax.random.key(0))
-        with pytest.raises(ValueError, match=f"like: .*checkpoint.npz holds another.*{named}"):
+        with pytest.raises(ValueError, match=f"like: .*checkpoint.npz contains another.*{named}"):
             mpfjax.load_checkpoint(path, like=other)
 
 
