@@ -6,7 +6,7 @@ import pathlib as _pathlib
 from typing import Any as _Any
 
 # The one place that says it: pyproject.toml reads it from here.
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def _homes() -> dict[str, tuple[str, str]]:
