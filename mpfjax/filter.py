@@ -96,8 +96,10 @@ class Filter(eqx.Module):
         if not any(move.weighs for move in self.moves):
             who = f"moves: {', '.join(map(name_of, self.moves)) or 'none'}"
             raise ValueError(f"{who} never weigh the particles by what is observed, as Propagate")
-        now = self._now()
-        for move in (*self.initial_moves, *self.moves):
+        now, moves = self._now(), (*self.initial_moves, *self.moves)
+        if (check := getattr(self.model, "check_moves", None)) is not None:
+            check(all_of(moves))
+        for move in moves:
             move.check(now, self.num_particles, self.num_components)
         memory_of(self.moves, now, self.num_components)
         if self._keeps_parents:

@@ -22,6 +22,7 @@ from mpfjax.moves.objects.bernoulli import Associate
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, Reassembly
+from mpfjax.moves.objects.regeneration import RegenerateObjects
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import OnCircles, Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
@@ -312,7 +313,7 @@ def bernoulli_filter(
     `TargetsModel` if neither the number of objects nor the origin of the measurements is known. For
     a single object use a filter with `ClutteredModel`, for boxes in a video `vision.ObjectTracker`.
     """
-    resample = GaussianRegeneration() if resample is None else resample
+    resample = RegenerateObjects() if resample is None else resample
     associate = Associate(
         particles_per_birth=particles_per_birth,
         undetected_particles=undetected_particles,

@@ -33,6 +33,7 @@ from mpfjax import (
 )
 from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.moves.objects.exclusion import Exclusion
+from mpfjax.moves.objects.regeneration import RegenerateObjects
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 
 NUM_PARTICLES = 48
@@ -83,6 +84,7 @@ WITHIN_COMPONENTS: dict[str, AbstractResampling] = {
         particles_per_component=5, noise="stratified"
     ),
     "gaussian, point sets": GaussianRegeneration(noise="rqmc"),
+    "gaussian, of objects": RegenerateObjects(),
 }
 
 

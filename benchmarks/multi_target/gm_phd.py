@@ -1,6 +1,6 @@
 """A Gaussian mixture PHD filter (Vo and Ma 2006), extended where motion or sensor is not linear."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -13,11 +13,12 @@ Mixture = tuple[np.ndarray, np.ndarray, np.ndarray]  # weights, means and covari
 def followed(scene: Scene, scans: tuple[np.ndarray, ...]) -> Iterator[tuple[np.ndarray, float]]:
     """The positions of the objects after each scan, and how many there are.
 
-    Objects that may appear anywhere are born at the plots of the scan before, with the velocity
-    unknown, as filters with births from measurements have it. Several sensors correct in turn.
+    Objects that may appear anywhere are born at all sensors' plots of the scan before, with the
+    velocity unknown, as filters with births from measurements have it. Several sensors
+    correct in turn.
     """
-    born = _around_spots(scene, scene.rate)
-    w, m, P = _around_spots(scene, scene.first)
+    born = around_spots(scene, scene.rate)
+    w, m, P = around_spots(scene, scene.first)
     for plots in zip(*scans, strict=True):
         seen = [each[~np.isnan(each[:, 0])] for each in plots]
         w, (m, P) = SURVIVAL * w, predicted(scene, m, P)
@@ -27,10 +28,10 @@ def followed(scene: Scene, scans: tuple[np.ndarray, ...]) -> Iterator[tuple[np.n
         number = np.round(w).astype(int)
         yield np.repeat(m[:, PLACE], number, axis=0), float(np.round(w.sum()))
         if scene.spots is None:
-            born = at_plots(scene, scene.sensors[0], seen[0])
+            born = at_plots(scene, seen)
 
 
-def _around_spots(scene: Scene, number: float) -> Mixture:
+def around_spots(scene: Scene, number: float) -> Mixture:
     """So many objects around the spots, if there are any."""
     size = len(scene.root)
     spots = np.zeros((0, size)) if scene.spots is None else scene.spots
@@ -45,18 +46,25 @@ def predicted(scene: Scene, m: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, n
     return moved(m), F @ P @ F.swapaxes(1, 2) + scene.root @ scene.root.T
 
 
-def at_plots(scene: Scene, sensor: Sensor, z: np.ndarray) -> Mixture:
-    """New objects at a sensor's plots."""
+def at_plots(scene: Scene, scans: Sequence[np.ndarray]) -> Mixture:
+    """New objects at the plots of all sensors, which share the rate evenly."""
+    each = [at_plot(scene, *pair) for pair in zip(scene.sensors, scans, strict=True)]
+    means, covariances = map(np.concatenate, zip(*each, strict=True))
+    return np.full(len(means), scene.rate / max(len(means), 1)), means, covariances
+
+
+def at_plot(scene: Scene, sensor: Sensor, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means and covariances of new objects at each of a sensor's plots."""
     places, R = z, np.diag(np.square(sensor.deviations))
     P = np.zeros((len(z), 4, 4)) + np.diag(np.square(scene.deviations))
+    P[:, 0::2, 0::2] = R
     if sensor.origin is not None:
         r, angle = z.T
         c, s = np.cos(angle), np.sin(angle)
         places = np.stack([r * c, r * s], axis=1) + sensor.origin
         turn = np.stack([np.stack([c, -r * s], 1), np.stack([s, r * c], 1)], axis=1)
         P[:, 0::2, 0::2] = turn @ R @ turn.swapaxes(1, 2)
-    means = places @ np.eye(4)[PLACE]
-    return np.full(len(z), scene.rate / max(len(z), 1)), means, P
+    return places @ np.eye(4)[PLACE], P
 
 
 def _slopes(function: Callable, x: np.ndarray) -> np.ndarray:
@@ -65,23 +73,27 @@ def _slopes(function: Callable, x: np.ndarray) -> np.ndarray:
     return np.stack([(function(x + h) - function(x - h)) / 2e-4 for h in steps], axis=-1)
 
 
-def updated(sensor: Sensor, w: np.ndarray, m: np.ndarray, P: np.ndarray, z: np.ndarray) -> Mixture:
-    """The intensity after a scan: table I of the paper."""
-    d, p = m.shape[1], sensor.detection(m)
+def corrected(sensor: Sensor, m: np.ndarray, P: np.ndarray, z: np.ndarray) -> Mixture:
+    """Densities of the plots (k, n), means (k, n, d) and covariances (n, d, d) of each pair."""
     H = _slopes(lambda x: sensor.seen(x).T, m)
     S = H @ P @ H.swapaxes(1, 2) + np.diag(np.square(sensor.deviations))
-    gains = P @ H.swapaxes(1, 2) @ np.linalg.inv(S)
-    updated = (np.eye(d) - gains @ H) @ P
+    inverse = np.linalg.inv(S)
+    gains = P @ H.swapaxes(1, 2) @ inverse
     gaps = np.moveaxis(sensor.gaps(z.T[:, :, None], sensor.seen(m)[:, None]), 0, -1)
-    squares = np.einsum("kni,nij,knj->kn", gaps, np.linalg.inv(S), gaps)
+    squares = np.einsum("kni,nij,knj->kn", gaps, inverse, gaps)
     likely = np.exp(-0.5 * squares) / (2 * np.pi * np.sqrt(np.linalg.det(S)))
+    return likely, m + np.einsum("nij,knj->kni", gains, gaps), P - gains @ H @ P
+
+
+def updated(sensor: Sensor, w: np.ndarray, m: np.ndarray, P: np.ndarray, z: np.ndarray) -> Mixture:
+    """The intensity after a scan: table I of the paper."""
+    p, (likely, means, covariances) = sensor.detection(m), corrected(sensor, m, P, z)
     shares = p * w * likely
     shares /= sensor.density + shares.sum(axis=1, keepdims=True)
-    corrected = m + np.einsum("nij,knj->kni", gains, gaps)
     return (
         np.concatenate([(1 - p) * w, shares.ravel()]),
-        np.concatenate([m, corrected.reshape(-1, d)]),
-        np.concatenate([P, np.tile(updated, (len(z), 1, 1))]),
+        np.concatenate([m, means.reshape(-1, m.shape[1])]),
+        np.concatenate([P, np.tile(covariances, (len(z), 1, 1))]),
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.random import Generator
 
-from benchmarks.multi_target.gm_phd import at_plots, predicted, updated
+from benchmarks.multi_target.gm_phd import at_plot, predicted, updated
 from benchmarks.multi_target.scenes import PLACE, Scene, drawn
 
 Track = tuple[np.ndarray, np.ndarray]  # mean and covariance, (1, d) and (1, d, d)
@@ -36,7 +36,7 @@ def _advanced(scene: Scene, rng: Generator, state: np.ndarray, track: Track | No
         if rng.random() < sensor.detection(state[None])[0]:
             plot = sensor.seen(state[None]).T + sensor.deviations * rng.normal(size=(1, 2))
             if track is None:
-                track = at_plots(scene, sensor, plot)[1:]
+                track = at_plot(scene, sensor, plot)
             else:
                 _, means, covariances = updated(sensor, np.ones(1), *track, plot)
                 track = means[1:], covariances[1:]

@@ -29,6 +29,7 @@ class Sensor:
     p_d: float
     origin: tuple[float, float] | None = None
     reach: float = np.inf  # p_D falls by the density of a Gaussian of this deviation
+    has_border: bool = False  # p_D is 0 outside of the box
 
     def seen(self, states: Any, xp: Any = np) -> Any:
         """Measurements without noise, (2, n)."""
@@ -40,8 +41,12 @@ class Sensor:
 
     def detection(self, states: Any, xp: Any = np) -> Any:
         """p_D(x)."""
-        square = xp.square(self.seen(states, xp)[0] / self.reach)
-        return self.p_d * xp.exp(-0.5 * square)
+        seen = self.seen(states, xp)
+        p = self.p_d * xp.exp(-0.5 * xp.square(seen[0] / self.reach))
+        if not self.has_border:
+            return p
+        low, high = (xp.asarray(end, p.dtype)[:, None] for end in (self.low, self.high))
+        return xp.where(xp.all((seen >= low) & (seen <= high), axis=0), p, 0.0)
 
     def gaps(self, plots: Any, seen: Any, xp: Any = np) -> Any:
         """Differences, (2, ...), of bearings on the circle."""
@@ -79,6 +84,12 @@ class Scene:
     room: int  # plots of a scan
     first: float = 0.0  # objects to expect at the start
     score: str = "ospa"  # or "gospa", of order 1
+    corners: tuple = ()  # of the box where objects appear anywhere; else the first sensor's
+
+    @property
+    def region(self) -> tuple:
+        """The corners of the box where objects appear anywhere."""
+        return self.corners or (self.sensors[0].low, self.sensors[0].high)
 
 
 def moved(states: Any, xp: Any = np) -> Any:
@@ -194,6 +205,16 @@ def pair(rng: Generator) -> np.ndarray:
     return np.stack([np.stack([along, one, s * side, s * speed], axis=1) for s in (1, -1)], axis=1)
 
 
+def convoy(rng: Generator) -> np.ndarray:
+    """Five in a line, eight metres from each to the next."""
+    states = np.stack([8.0 * np.arange(5) - 90, np.full(5, 2.0), *np.zeros((2, 5))], axis=1)
+    truth = np.empty((60, 5, 4))
+    for t in range(60):
+        truth[t] = states
+        states = states @ STEP.T + rng.normal(size=(5, 4)) @ SLOW_ROOT.T
+    return truth
+
+
 SLOW_ROOT = 0.1 * np.kron(np.eye(2), np.linalg.cholesky([[1 / 3, 1 / 2], [1 / 2, 1.0]]))
 
 
@@ -234,7 +255,14 @@ def _two_radars() -> Scene:
     west = Sensor((10.0, 0.01), low, high, 30.0, 0.95, (-1000.0, -1000.0), 2000.0)
     low, high = (0.0, np.pi / 2), (3000.0, np.pi)
     east = Sensor((10.0, 0.01), low, high, 30.0, 0.95, (1000.0, -1000.0), 2000.0)
-    return replace(_linear(False, 0.9), sensors=(west, east), room=70)
+    return replace(_linear(False, 0.9), sensors=(west, east), room=70, corners=SQUARE)
+
+
+def _two_fields() -> Scene:
+    """The same twelve, with two sensors that see a part of the square each."""
+    west, east = ((-1000.0, -600.0), (100.0, 600.0)), ((-100.0, -600.0), (1000.0, 600.0))
+    fields = [Sensor((10.0, 10.0), *box, 25.0, 0.95, has_border=True) for box in (west, east)]
+    return replace(_linear(False, 0.9), sensors=tuple(fields), room=60, corners=SQUARE)
 
 
 SCENES = {
@@ -247,6 +275,11 @@ SCENES = {
         (50.0, 50.0, 50.0, 50.0, 3 * ARC), TURN_SPOTS, 100.0, 40,
     ),
     "two radars": _two_radars(),
+    "two fields of view": _two_fields(),
+    "convoy": Scene(
+        convoy, (Sensor((1.0, 1.0), (-100.0, -50.0), (100.0, 50.0), 10.0, 0.9),),
+        SLOW_ROOT, 0.02, (1.0, 1.0, 1.0, 1.0), None, 10.0, 30, 5.0,
+    ),
     "crossing or parting": Scene(
         pair, (Sensor((1.0, 1.0), (-50.0, -50.0), (50.0, 50.0), 5.0, 0.95),),
         SLOW_ROOT, 0.02, (1.0, 1.0, 1.0, 1.0), None, 10.0, 20,
@@ -326,8 +359,6 @@ def model_of(scene: Scene) -> mpfjax.TargetsModel:
     """Motion, sensors, clutter and births."""
     rate = jnp.float32(scene.rate)
     if scene.spots is None:
-        first = scene.sensors[0]
-        low, high = SQUARE if first.origin else (first.low, first.high)
         speeds = scene.deviations[1]
 
         def newborn(key: Key[Array, ""], places: Array) -> Array:
@@ -335,7 +366,7 @@ def model_of(scene: Scene) -> mpfjax.TargetsModel:
             return jnp.stack([places[:, 0], v[:, 0], places[:, 1], v[:, 1]], axis=1)
 
         locate = tuple(partial(_located, sensor) for sensor in scene.sensors)
-        birth: Any = mpfjax.UniformBirth(rate, mpfjax.Box(low, high), newborn, locate)
+        birth: Any = mpfjax.UniformBirth(rate, mpfjax.Box(*scene.region), newborn, locate)
     else:
         birth = Spots(rate, scene)
     sensors = [

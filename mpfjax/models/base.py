@@ -8,7 +8,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -54,6 +54,8 @@ class AbstractStateSpaceModel(eqx.Module):
     """
 
     handles_missing = False
+    passes_inputs_to: ClassVar[tuple[str, ...]] = ()
+    """The fields with parts of the model, to which `with_inputs` hands u_t."""
 
     def with_inputs(self, inputs: PyTree) -> "AbstractStateSpaceModel":
         """The model at a step whose known inputs are u_t: the field `inputs` is set.
@@ -61,6 +63,8 @@ class AbstractStateSpaceModel(eqx.Module):
         A model may override it, so that any of its parameters varies in time. It is called while
         JAX traces a step, so it must not use the values of u_t in Python.
         """
+        if parts := self.passes_inputs_to:
+            return replace_fields(self, **{n: with_inputs(getattr(self, n), inputs) for n in parts})
         return replace_fields(self, inputs=inputs)
 
     @abc.abstractmethod
@@ -86,7 +90,14 @@ def _drawn_from_noise(model: Any, key: Key[Array, ""], states: PyTree) -> PyTree
 
 
 def takes_inputs(model: Any) -> bool:
-    """Whether a model takes u_t: it has a field `inputs`, or its own `with_inputs`."""
+    """Whether a model takes u_t: it has a field `inputs`, or its own `with_inputs`.
+
+    Or the parts of it to which it passes u_t do, functions among them.
+    """
+    if isinstance(model, tuple):
+        return any(map(takes_inputs, model))
+    if parts := getattr(model, "passes_inputs_to", ()):
+        return any(takes_inputs(getattr(model, name)) for name in parts)
     model = innermost(model)
     method = getattr(type(model), "with_inputs", AbstractStateSpaceModel.with_inputs)
     return hasattr(model, "inputs") or method is not AbstractStateSpaceModel.with_inputs
@@ -96,6 +107,8 @@ def with_inputs(model: Any, inputs: PyTree) -> Any:
     """The model with u_t, or unchanged where there is none, or where it takes none."""
     if inputs is None or not takes_inputs(model):
         return model
+    if isinstance(model, tuple):
+        return tuple(with_inputs(part, inputs) for part in model)
     if hasattr(model, "with_inputs"):
         return model.with_inputs(inputs)
     return replace_fields(model, inputs=inputs)

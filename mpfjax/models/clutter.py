@@ -14,13 +14,7 @@ from mpfjax.arrays import (
     to_array,
 )
 from mpfjax.checks import SHARES
-from mpfjax.models.base import (
-    AbstractStateSpaceModel,
-    is_made_of_noise,
-    over_particles,
-    replace_fields,
-    with_inputs,
-)
+from mpfjax.models.base import AbstractStateSpaceModel, is_made_of_noise, over_particles
 from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.operations.logarithms import default_float, log_or_nothing
 from mpfjax.operations.stored import on_platform
@@ -60,6 +54,9 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
     - `clutter_density`: λ, the expected number of false measurements per step and unit of the
       measurement space. A positive number, or a function of one measurement.
 
+    u_t reaches the object model, and functions with a field `inputs`, as an `eqx.Module` may have:
+    p_D of a sensor that moves, or 0 while it is off.
+
     Each observation has room for K measurements, leaves (K, ...): rows with a NaN are not
     measurements, and a step without any means that the object was missed. A step in which the
     sensor was off is a missing one, see `Series`. All other properties are those of the object
@@ -79,15 +76,12 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
     ) = eqx.field(converter=number_or_function("clutter_density"))
 
     handles_missing = True
+    passes_inputs_to = ("object_model", "detection_probability", "clutter_density")
 
     def __check_init__(self) -> None:
         super().__check_init__()
         instead, name = "draw its regimes as part of the state", "object_model"
         refuse_marginalised(self.object_model, "ClutteredModel", instead, name)
-
-    def with_inputs(self, inputs: PyTree) -> "ClutteredModel":
-        """The model whose object has the inputs u_t."""
-        return replace_fields(self, object_model=with_inputs(self.object_model, inputs))
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """x_0 of the object."""

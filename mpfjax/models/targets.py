@@ -1,6 +1,6 @@
 """Objects that appear and disappear, observed by sensors with missed detections and clutter."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -12,7 +12,7 @@ from mpfjax.arrays import (
     to_array,
 )
 from mpfjax.checks import SHARES, is_series
-from mpfjax.models.base import AbstractStateSpaceModel, over_particles, replace_fields, with_inputs
+from mpfjax.models.base import AbstractStateSpaceModel, over_particles
 from mpfjax.models.births import AbstractBirth
 from mpfjax.models.clutter import PASSED_ON, ClutteredModel, number_or_function
 from mpfjax.operations.logarithms import default_float
@@ -43,9 +43,10 @@ class TargetsModel(AbstractStateSpaceModel, Fitting):
 
     An observation is the same as for `ClutteredModel`, K rows of which those with a NaN are not
     measurements; with several sensors it is a tuple of these. A scan without measurements means
-    that every object was missed; a scan with the sensor off is a missing one, see `Series`. log
-    L(y_t | x) assumes that x is the only object. Raises `ValueError` for numbers outside these
-    ranges and other sensors.
+    that every object was missed; a step with all sensors off is a missing one, see `Series`, and a
+    single one that is off has p_D = 0. u_t reaches the sensors, and the birth and p_S if they have
+    a field `inputs`: a rate may depend on the time since the last scan. log L(y_t | x) assumes that
+    x is the only object. Raises `ValueError` for numbers outside these ranges and other sensors.
     """
 
     sensors: tuple[ClutteredModel, ...] = eqx.field(converter=_as_sensors)
@@ -58,12 +59,13 @@ class TargetsModel(AbstractStateSpaceModel, Fitting):
     )
 
     handles_missing = True
+    passes_inputs_to = ("sensors", "birth", "survival_probability")
 
-    def with_inputs(self, inputs: PyTree) -> "TargetsModel":
-        """The model whose objects have the inputs u_t."""
-        return replace_fields(
-            self, sensors=tuple(with_inputs(each, inputs) for each in self.sensors)
-        )
+    def check_moves(self, moves: Iterable[Any]) -> None:
+        """Raise a `ValueError` for moves of which none weighs births and deaths, as `Associate`."""
+        if not any(getattr(move, "weighs_targets", False) for move in moves):
+            what = "model: a TargetsModel, whose births and deaths these moves would leave out"
+            raise ValueError(f"{what}; it is for bernoulli_filter")
 
     def scans(self, observation: PyTree) -> tuple[PyTree, ...]:
         """The measurements of each sensor; a `ValueError` for another number of these."""

@@ -6,7 +6,7 @@ recipe, the transforms and the moves that it is made of.
 
 from typing import NamedTuple
 
-from tests.matrix.filters import parts
+from tests.matrix.filters import FILTERS, parts
 from tests.matrix.models import FORMS
 
 Names = frozenset[str] | None
@@ -76,6 +76,8 @@ RULES = (
          forms=but(FORMS, "one of several"), filters=OF_OBJECTS),
     Rule("TargetsModel", "`bernoulli_filter` is for a `TargetsModel`",
          forms=but(FORMS, "targets"), filters=these("Bernoulli")),
+    Rule("TargetsModel", "a `TargetsModel` is for `bernoulli_filter`",
+         forms=these("targets"), filters=but(FILTERS, "Bernoulli")),
     Rule("transition_mean|observation_mean",
          "`GaussNewtonProposal` needs the model's means and covariances",
          forms=but(FORMS, *WITH_MEANS), filters=these("guided", "auxiliary")),

@@ -1,6 +1,8 @@
 """Objects that come and go, against the enumeration of all associations and Gaussian sums."""
 
 import itertools
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,6 +15,7 @@ import mpfjax
 from mpfjax import ClutteredModel, Filter, TargetsModel
 from mpfjax.moves.objects.association import associate
 from mpfjax.moves.objects.bernoulli import TARGETS, Associate
+from mpfjax.moves.objects.regeneration import RegenerateObjects
 from mpfjax.moves.propagation.propagate import Predict
 from tests.marking import weekly
 from tests.models.test_clutter import SETS, by_associations
@@ -250,12 +253,8 @@ class Wide(mpfjax.AbstractProposal):
         return A * previous_states + scale * noise, log_density
 
 
-@pytest.mark.exactness
-@pytest.mark.parametrize("proposal", [None, *weekly([Wide()])])
-def test_objects_not_detected_yet_are_those_of_gaussian_sums(proposal):
-    """Two scans from a Poisson number of objects, in whose second no two compete."""
-    number, rate, survival = 2.0, 0.5, 0.95
-    first, second = np.array([-2.5, 2.0]), 2.2
+def gaussian_sums(number, rate, survival, first, second):
+    """Two scans: r of each old and new object, how many are undetected, and the evidence."""
     born = (rate, 0.0, P0)
     unseen = [predicted((number, 0.0, P0), survival), born]
     log_evidence = -P_D * sum(w for w, *_ in unseen)
@@ -270,13 +269,21 @@ def test_objects_not_detected_yet_are_those_of_gaussian_sums(proposal):
     log_evidence -= P_D * sum(w for w, *_ in unseen)
     objects = [[predicted(g, survival) for g in gaussians] for gaussians in objects]
     r = np.array([sum(w for w, *_ in gaussians) for gaussians in objects])
-    pairs = [sum(updated(g, second)[0] for g in gaussians) for gaussians in objects]
-    started = sum(updated(g, second)[0] for g in unseen)
-    shares, log_total = enumerated(np.c_[pairs], 1 - P_D * r, [1 + started])
-    old = (1 - shares[:, 0]) * r * (1 - P_D) / (1 - P_D * r) + shares[:, 0]
-    new = (1 - shares.sum()) * started / (1 + started)
-    undetected = (1 - P_D) * sum(w for w, *_ in unseen)
+    pairs = [[sum(updated(g, z)[0] for g in each) for z in second] for each in objects]
+    started = np.array([sum(updated(g, z)[0] for g in unseen) for z in second])
+    shares, log_total = enumerated(np.array(pairs), 1 - P_D * r, 1 + started)
+    old = (1 - shares.sum(axis=1)) * r * (1 - P_D) / (1 - P_D * r) + shares.sum(axis=1)
+    new = (1 - shares.sum(axis=0)) * started / (1 + started)
+    return old, new, (1 - P_D) * sum(w for w, *_ in unseen), log_evidence + log_total
 
+
+@pytest.mark.exactness
+@pytest.mark.parametrize("proposal", [None, *weekly([Wide()])])
+def test_objects_not_detected_yet_are_those_of_gaussian_sums(proposal):
+    """Two scans from a Poisson number of objects, in whose second no two compete."""
+    number, rate, survival = 2.0, 0.5, 0.95
+    first, second = np.array([-2.5, 2.0]), 2.2
+    old, new, undetected, log_evidence = gaussian_sums(number, rate, survival, first, [second])
     filter = mpfjax.bernoulli_filter(
         model(rate, survival_probability=survival, initial_number=number), 3000, 6,
         particles_per_birth=500, undetected_particles=1000, resample=mpfjax.Resample(),
@@ -292,10 +299,29 @@ def test_objects_not_detected_yet_are_those_of_gaussian_sums(proposal):
     np.testing.assert_allclose(np.sort(found[:, :2].mean(0)), np.sort(old), atol=0.02)
     np.testing.assert_allclose(found[:, 2].mean(), new, atol=0.02)
     np.testing.assert_allclose(last.undetected.mean(), undetected, atol=0.05)
-    exact_number = old.sum() + new + undetected
+    exact_number = old.sum() + new.sum() + undetected
     np.testing.assert_allclose(last.expected_number.mean(), exact_number, atol=0.03)
     log_z = np.asarray(runs.log_marginal_likelihood)
-    np.testing.assert_allclose(log_z.mean(), log_evidence + log_total, atol=0.03)
+    np.testing.assert_allclose(log_z.mean(), log_evidence, atol=0.03)
+
+
+@pytest.mark.exactness
+@pytest.mark.parametrize("second", [[0.1, 0.6], [0.4]])
+def test_components_that_began_in_one_scan_are_not_one_object(second):
+    """Each has a measurement of its own there, until the next scan tells them apart."""
+    first = np.array([0.0, 0.7])
+    old, new, undetected, log_evidence = gaussian_sums(0.0, 0.5, 0.95, first, second)
+    filter = mpfjax.bernoulli_filter(
+        model(), 2000, 6, particles_per_birth=500, resample=mpfjax.Resample()
+    )
+    scans = jnp.asarray([first, [*second, *[NAN] * (2 - len(second))]], jnp.float32)[..., None]
+    runs = mpfjax.monte_carlo(
+        jax.random.split(KEY, 8), filter, scans, collect=mpfjax.estimate_targets
+    )
+    found = np.asarray(runs.collected.expected_number)[:, -1].mean()
+    np.testing.assert_allclose(found, old.sum() + new.sum() + undetected, atol=0.05)
+    log_z = np.asarray(runs.log_marginal_likelihood)
+    np.testing.assert_allclose(log_z.mean(), log_evidence, atol=0.05)
 
 
 @pytest.mark.exactness
@@ -455,3 +481,204 @@ def test_new_objects_are_even_in_a_region(region):
     found = np.asarray(near(proposed) * jnp.exp(log_weights))
     error = np.hypot(expected.std(), found.std()) / np.sqrt(20_000)
     assert abs(expected.mean() - found.mean()) < 4 * error < 0.03
+
+
+def test_first_existences_are_those_of_a_grid():
+    """Objects anywhere in 1000 m, seen with an error of 1 m and a p_D that changes at 0.
+
+    After four empty scans there are far more where they are seldom detected.
+    """
+    rate, number, survival, half = 0.1, 3.0, 0.98, 500.0
+    walk = mpfjax.LinearGaussianModel([[1.0]], [[0.25]], [[1.0]], [[1.0]], [0.0], [[1.0]])
+
+    def locate(key, z, n):
+        noise = jax.random.normal(key, (n, 1))
+        return z[None] + noise, jax.scipy.stats.norm.logpdf(noise[:, 0])
+
+    def detection(states):
+        return jnp.where(states[:, 0] < 0, 0.8, 0.1)
+
+    region = mpfjax.Box([-half], [half])
+    birth = mpfjax.UniformBirth(rate, region, lambda key, places: places, locate)
+    sensor, clutter = ClutteredModel(walk, detection, 0.02), 0.02
+    targets = TargetsModel(sensor, birth, survival, number)
+    scan = np.linspace(-450, 450, 10)
+    scans = jnp.full((5, 10, 1), jnp.nan).at[4, :, 0].set(scan)
+
+    x = np.arange(-520, 520, 0.1)
+    kernel = density(np.arange(-30, 31) * 0.1, 0.0, 0.25) * 0.1
+    born = np.where(np.abs(x) <= half, rate / (2 * half), 0.0)
+    u, p = number * born / rate, np.where(x < 0, 0.8, 0.1)
+    for t in range(5):
+        u = np.convolve(survival * u, kernel, mode="same") + born
+        if t < 4:
+            u *= 1 - p
+    odds = (p * u * density(scan[:, None], x, 1.0)).sum(axis=1) * 0.1 / clutter
+    exact = odds / (1 + odds)
+
+    filter = mpfjax.bernoulli_filter(targets, 1000, 12)
+    runs = mpfjax.monte_carlo(
+        jax.random.split(KEY, 8), filter, scans, collect=mpfjax.estimate_targets
+    )
+    existence, means = (np.asarray(leaf)[:, -1] for leaf in runs.collected[1:3])
+    nearest = np.abs(means[..., 0] - scan[:, None, None]).argsort(axis=2)[..., 0]
+    found = np.take_along_axis(existence, nearest.T, axis=1)
+    ratios = found / exact
+    assert 0.8 < np.median(ratios) < 1.25
+    assert np.mean(np.abs(np.log(ratios)) < np.log(1.25)) > 0.9
+
+
+@pytest.mark.exactness
+def test_initial_objects_leave_no_weight_below_zero():
+    """Of products that a compiler may fuse."""
+    filter = mpfjax.bernoulli_filter(model(), 5000, 4)
+    scan = jnp.array([[0.3], [-0.8]])
+
+    def log_evidence(number):
+        mixture = filter.init(KEY)
+        targets = mixture.memory[TARGETS] | {"number": number}
+        mixture = mixture.replace(memory=mixture.memory | {TARGETS: targets})
+        moved, info = filter.step(KEY, mixture, scan)
+        return info.log_likelihood_increment, moved.log_weights
+
+    values, log_weights = jax.jit(jax.vmap(log_evidence))(jnp.linspace(0.1, 4, 10))
+    assert np.isfinite(values).all()
+    assert not np.isnan(log_weights).any()
+
+
+@pytest.mark.exactness
+@pytest.mark.parametrize("num_sensors", [1, 2])
+def test_detection_that_is_certain_or_never_happens(num_sensors):
+    """Empty scans, their evidence and its derivative by p_D, and scans with measurements."""
+    empty = jnp.full((3, 2, 1), jnp.nan)
+    seen = empty.at[0].set(jnp.array([[0.3], [1.0]])).at[2, 0].set(0.2)
+
+    def log_evidence(p, number, scans):
+        targets = TargetsModel(
+            (ClutteredModel(OBJECT, p, CLUTTER),) * num_sensors,
+            Birth(jnp.float32(0.5)),
+            0.95,
+            number,
+        )
+        filter = mpfjax.bernoulli_filter(targets, 800, 4)
+        scans = scans if num_sensors == 1 else (scans, scans[:, ::-1])
+        run = mpfjax.run_filter(KEY, filter, scans, collect=mpfjax.estimate_targets)
+        return run.log_marginal_likelihood, run.collected.expected_number
+
+    def exact(p, number):
+        total = 0.0
+        for _ in range(3):
+            number = 0.95 * number + 0.5
+            total, number = (
+                total - number * (1 - (1 - p) ** num_sensors),
+                number * (1 - p) ** num_sensors,
+            )
+        return total
+
+    p, number = jnp.array([0.0, 0.0, 1.0, 1.0]), jnp.array([0.0, 2.0, 0.0, 2.0])
+    both = jax.vmap(jax.value_and_grad(log_evidence, has_aux=True), in_axes=(0, 0, None))
+    both = jax.jit(both)
+    (values, numbers), slopes = both(p, number, empty)
+    expected, expected_slopes = jax.vmap(jax.value_and_grad(exact))(p, number)
+    np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(slopes, expected_slopes, rtol=0.01, atol=1e-4)
+    np.testing.assert_allclose(numbers[2:], 0.0, atol=1e-6)
+    (values, numbers), slopes = both(p, number, seen)
+    assert np.isfinite(values).all()
+    assert np.isfinite(slopes).all()
+    np.testing.assert_allclose(values[:2], 0.0, atol=1e-5)
+
+
+class Inputs(eqx.Module):
+    """Whatever is made of u_t at a step."""
+
+    function: Callable = eqx.field(static=True)
+    inputs: Any = None
+
+    def __call__(self, values):
+        return self.function(self.inputs, values)
+
+
+class WithoutInputs(mpfjax.AbstractStateSpaceModel):
+    """The object, with nothing that depends on u_t."""
+
+    def sample_initial(self, key, num_particles):
+        return OBJECT.sample_initial(key, num_particles)
+
+    def sample_transition(self, key, states):
+        return OBJECT.sample_transition(key, states)
+
+    def log_likelihood(self, observation, states):
+        return OBJECT.log_likelihood(observation, states)
+
+
+class BirthInTime(mpfjax.AbstractBirth):
+    """The rate is that of u_t."""
+
+    inputs: Any = None
+
+    @property
+    def rate(self):
+        return self.inputs["rate"]
+
+    def sample(self, key, num_particles):
+        return Birth(0.0).sample(key, num_particles)
+
+    def propose(self, *arguments):
+        return Birth(0.0).propose(*arguments)
+
+
+@pytest.mark.exactness
+def test_inputs_reach_survival_births_detection_and_clutter():
+    """As numbers do that are the same; a sensor that is off has a p_D of 0."""
+    p, clutter, survival, rate = 0.8, 0.3, 0.6, 1.5
+    in_time = TargetsModel(
+        ClutteredModel(
+            WithoutInputs(),
+            Inputs(lambda u, states: jnp.full(len(states), u["p"])),
+            Inputs(lambda u, measurement: u["clutter"]),
+        ),
+        BirthInTime(),
+        Inputs(lambda u, states: jnp.full(len(states), u["survival"])),
+        2.0,
+    )
+    numbers = {"p": p, "clutter": clutter, "survival": survival, "rate": rate}
+    inputs = {name: jnp.full(3, value) for name, value in numbers.items()}
+    inputs["p"] = inputs["p"].at[1].set(0.0)
+    scans = jnp.array([[[0.3], [1.0]], [[NAN], [NAN]], [[0.2], [NAN]]])
+    series = mpfjax.Series(scans, inputs)
+    filter = mpfjax.bernoulli_filter(in_time, 600, 4)
+    run = mpfjax.run_filter(KEY, filter, series, collect=mpfjax.estimate_targets)
+    fixed = TargetsModel(
+        ClutteredModel(WithoutInputs(), p, clutter), Birth(jnp.float32(rate)), survival, 2.0
+    )
+    filter = mpfjax.bernoulli_filter(fixed, 600, 4)
+    same = mpfjax.run_filter(KEY, filter, scans[:1], collect=mpfjax.estimate_targets)
+    np.testing.assert_allclose(
+        run.log_likelihood_increments[0], same.log_likelihood_increments[0], rtol=1e-5
+    )
+    assert run.log_likelihood_increments[1] == 0
+    numbers = run.collected.expected_number
+    np.testing.assert_allclose(numbers[0], same.collected.expected_number[0], rtol=1e-5)
+    np.testing.assert_allclose(numbers[1], survival * numbers[0] + rate, rtol=1e-4)
+    with pytest.raises(ValueError, match="inputs: TargetsModel has neither"):
+        mpfjax.run_filter(KEY, filter, series)
+
+
+@pytest.mark.exactness
+def test_regenerated_objects_have_the_covariance_of_their_weights_and_more_slots_where_they_exist():
+    """Over samples of ten, the variance is the population's; the paper's estimate is less."""
+    n, rng = 10, np.random.default_rng(0)
+    filter = Filter(model(), [Predict(), Associate(undetected_particles=1)], 101, 3)
+    states = rng.normal(0, 2, (400, 2, n, 1))
+    mixture = bernoulli_mixture(filter, states[0], [0.999, 0.001])
+
+    def redrawn(key, states):
+        particles = mixture.particles.at[-2 * n :].set(states.reshape(-1, 1).astype(jnp.float32))
+        return RegenerateObjects()(key, mixture.replace(particles=particles))
+
+    moved = jax.jit(jax.vmap(redrawn))(jax.random.split(KEY, 400), states)
+    indicators, draws = np.asarray(moved.component_indicators[0]), np.asarray(moved.particles)
+    counts = np.bincount(indicators, minlength=3)
+    np.testing.assert_allclose(counts[1] / counts[2], 999**0.25, rtol=0.1)
+    assert_unbiased(draws[:, indicators == 1, 0].var(axis=1, ddof=1), 4.0)

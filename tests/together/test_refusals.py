@@ -363,6 +363,12 @@ REFUSED = (
         MODEL, 5, importance="predictive_gaussian", proposal=GUIDE)),
     ("num_slots: 3 is not at least N, 4",
      lambda: mpfjax.monte_carlo(KEY[None], FILTER, TWO, num_slots=3)),
+    *(
+        ("model: a TargetsModel, whose .* would leave out; it is for bernoulli_filter",
+         lambda make=make: make(mpfjax.TargetsModel(**TARGETS), 10))
+        for make in (mpfjax.particle_filter,
+                     lambda model, n: mpfjax.mixture_particle_filter(model, n, 2))
+    ),
     # observations
     (r"observations: shapes .* jnp.asarray\(observations\)", lambda: run(FILTER, [0.0, 1.0])),
     ("observations: NaN or infinite at index 1", lambda: run(FILTER, np.array([0.0, NAN, 1.0]))),

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 from mpfjax.checks import Count, check
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
@@ -21,19 +21,28 @@ from mpfjax.operations.stored import take
 
 TARGETS = "targets"
 _LEAST_EXISTENCE = 1e-4  # of an object with a component: one less probable needs no particles
+_NEAREST = 16  # undetected particles at a measurement that say how many objects to expect there
+_FAR = 1e6  # a difference of log odds beyond which particles are equally far
+_ENOUGH = 8.0  # effective particles at a measurement, from which an object may begin
 _SAME = 2.0  # pooled deviations within which two components may describe one object
 
 
 class _Intensity(NamedTuple):
     """How many objects to expect at each particle, as a step goes on.
 
-    The first `num_undetected` particles are of objects that no measurement has revealed. The
-    others are of objects that may exist, each in an `owners` of its own.
+    The first `num_undetected` particles are of objects that no measurement has revealed, old ones
+    and then new ones. The others are of objects that may exist, each in an `owners` of its own.
+    `starts` are the sensors, from 1 on, whose last scan revealed an object first, 0 for older ones.
+    `references` are the masses of the undetected particles as draws of a newborn object, 0 of those
+    that had a component, and `densities` how many times as many old objects are at each.
     """
 
     states: PyTree
     masses: Float[Array, " p"]
     owners: Int[Array, " q"]
+    starts: Int[Array, " m"]
+    references: Float[Array, " u"]
+    densities: Float[Array, " v"]
     num_undetected: int
     num_objects: int
     log_evidence: Float[Array, ""]
@@ -62,10 +71,15 @@ class Associate(AbstractWrapper):
 
     1. Two components are merged if they describe one object that was started by different
        measurements: their means are within two pooled standard deviations in each component of the
-       state, and their r sum to at most one. u is multiplied by p_S, and new objects are added to
+       state, their r sum to at most one, and the last scan of a sensor did not start both, since an
+       object has one measurement in it. u is multiplied by p_S, and new objects are added to
        component 0.
-    2. Each measurement may be the first of an object, whose particles are drawn ∝ G_j u from
-       component 0, and from those that the birth model proposes at the measurement.
+    2. Each measurement may be the first of an object. The birth model proposes its particles at the
+       measurement, weighted by how many objects, new or not yet detected, there are at this place
+       for each newborn one. This ratio is averaged over the particles of component 0 that are
+       nearest to the measurement, and exact where all undetected objects are distributed like
+       newborn ones. If enough of these particles are at the measurement itself, they are drawn
+       ∝ G_j u instead.
     3. Each u becomes u (1 - p_D) P(m has none) / P₀ + Σ_j u G_j P(m has j) / Σ_m u G_j, with the
        probabilities of `associate`, and u (1 - p_D) in component 0.
     4. The M most probable objects are retained, the first in component 1. Others, and those below
@@ -74,11 +88,13 @@ class Associate(AbstractWrapper):
     5. Each component is resampled, by `resample`, and component 0 systematically.
 
     The total weight grows by log p of the scan over log p of clutter alone, as in `ClutteredModel`.
-    Four steps are approximate: belief propagation, whose log p is Bethe's, and exact if no two
-    objects compete for two measurements; the merging of components; step 4; and the product form
-    after each scan. Labels count objects from 1. They are not identities once two objects have been
-    close, for any filter. `memory["targets"]` contains the number, the labels, and how many objects
-    were crowded out.
+    It is exact for one scan of one sensor in which no two objects compete for two measurements.
+    Four steps are approximate: belief propagation, whose log p is otherwise Bethe's; the merging of
+    components; step 4; and the product form after the scan of each sensor, by which objects are
+    independent although the scan made them exclude each other, so that log Ẑ of several scans or
+    sensors has an error. Labels count objects from 1. They are not identities once two objects have
+    been close, for any filter. `memory["targets"]` contains the number, the labels, and how many
+    objects were crowded out.
 
     - `particles_per_birth`: the number of particles of a new object at each measurement.
     - `undetected_particles`: the number of particles of component 0, which fill the first slots.
@@ -93,7 +109,7 @@ class Associate(AbstractWrapper):
 
     holds = ("resample",)
     approximate = True
-    weighs = True
+    weighs = weighs_targets = True
     keeps_mass = False
     keeps_parents = False
     keeps_families = False
@@ -103,8 +119,10 @@ class Associate(AbstractWrapper):
         memory = {
             "number": getattr(now.model, "initial_number", jnp.zeros(())),
             "labels": jnp.zeros(num_components, jnp.int32),
+            "starts": jnp.zeros(num_components, jnp.int32),
             "next_label": jnp.ones((), jnp.int32),
             "crowded_out": jnp.zeros(()),
+            "references": jnp.full(self.undetected_particles, 1 / self.undetected_particles),
         }
         return {TARGETS: memory} | super().initial_memory(now, num_components)
 
@@ -127,6 +145,8 @@ class Associate(AbstractWrapper):
         scans = () if now.observation is None else model.scans(now.observation)
         key_new, key_last, *keys = split(key, 2 + len(scans))
         intensity = self._predict(key_new, mixture, model)
+        if scans:
+            intensity = intensity._replace(starts=jnp.zeros_like(intensity.starts))
         for number, (key_scan, scan) in enumerate(zip(keys, scans, strict=True)):
             intensity = self._update(key_scan, intensity, model, scan, number)
         return self._resample(key_last, mixture, intensity)
@@ -135,13 +155,13 @@ class Associate(AbstractWrapper):
         self, key: Key[Array, ""], mixture: ParticleMixture, model: TargetsModel
     ) -> _Intensity:
         """The intensity before the scan: of survivors and new objects."""
-        size, number = self.undetected_particles, mixture.memory[TARGETS]["number"]
-        components = _once_each(mixture, number)
+        size, memory = self.undetected_particles, mixture.memory[TARGETS]
+        number, references = memory["number"], memory["references"]
+        components = _once_each(mixture, number, memory["starts"])
         masses = number * mixture.weights * model.survival(mixture.particles)
         undetected = jnp.where(components == 0, masses, 0.0)
         # In the first step these fill all slots, of which the first ones stand for all.
-        tiny = jnp.finfo(masses.dtype).tiny
-        share = jnp.sum(undetected) / jnp.maximum(jnp.sum(undetected[:size]), tiny)
+        old = jnp.sum(undetected) * _normalised(undetected[:size])
         rate = jnp.broadcast_to(model.birth.rate / size, (size,))
 
         def join(old: Array, new: Array) -> Array:
@@ -149,8 +169,11 @@ class Associate(AbstractWrapper):
 
         return _Intensity(
             jax.tree.map(join, mixture.particles, model.birth.sample(key, size)),
-            jnp.concatenate([share * undetected[:size], rate, (masses - undetected)[size:]]),
+            jnp.concatenate([old, rate, jnp.where(components > 0, masses, 0.0)[size:]]),
             jnp.maximum(components[size:] - 1, 0),
+            memory["starts"][1:],
+            jnp.append(references, jnp.full_like(references, 1 / size)),
+            jnp.where(references > 0, old / jnp.where(references > 0, references, 1.0), 0.0),
             2 * size,
             mixture.num_components - 1,
             jnp.zeros_like(mixture.log_scale),
@@ -169,11 +192,15 @@ class Associate(AbstractWrapper):
         sensor, first = model.sensors[number], before.num_undetected
         log_odds, detection = sensor.log_odds(scan, before.states), sensor.detection(before.states)
         born, log_born = self._born(key_born, model, scan, number)
+        num_survivors = first // 2  # the others are new ones, proposed at the measurements
+        density, is_dense = _density_at(log_odds[:num_survivors], detection[:num_survivors], before)
+        log_born += jnp.log1p(jnp.where(is_dense, 0.0, density) / model.birth.rate)[:, None]
         highest = jnp.maximum(jnp.max(log_odds, axis=0), jnp.max(log_born, axis=1))
         units = jax.lax.stop_gradient(jnp.maximum(highest, 0.0))
         likely = (before.masses * detection)[:, None] * exp(log_odds - units[None])
-        num_survivors = first // 2  # the others are new ones, proposed at the measurements
-        starts = jnp.concatenate([likely[:num_survivors].T, exp(log_born - units[:, None])], axis=1)
+        begins = is_dense[:, None] | (before.references[None, :num_survivors] == 0)
+        begins = jnp.where(begins, likely[:num_survivors].T, 0.0)
+        starts = jnp.concatenate([begins, exp(log_born - units[:, None])], axis=1)
 
         pairs, unseen = before.sums(likely), before.masses * (1 - detection)
         missed = before.sums(unseen) + jnp.maximum(1 - before.sums(before.masses), 0.0)
@@ -202,6 +229,7 @@ class Associate(AbstractWrapper):
             states=jax.tree.map(join, before.states, born),
             masses=jnp.concatenate([masses, new_masses.reshape(-1)]),
             owners=jnp.concatenate([before.owners, new_owners]),
+            starts=jnp.pad(before.starts, (0, num_rows), constant_values=number + 1),
             num_objects=before.num_objects + num_rows,
             log_evidence=before.log_evidence + log_evidence,
         )
@@ -219,9 +247,10 @@ class Associate(AbstractWrapper):
         def propose(key: Key[Array, ""], measurement: PyTree) -> tuple:
             states, log_masses = model.birth.propose(key, measurement, size, number)
             one = jax.tree.map(lambda leaf: leaf[None], measurement)
-            log_masses += sensor.log_odds(one, states)[:, 0] + jnp.log(sensor.detection(states))
+            log_masses += sensor.log_odds(one, states)[:, 0]
+            log_masses += log_or_nothing(sensor.detection(states))
             for earlier in model.sensors[:number]:
-                log_masses += jnp.log1p(-earlier.detection(states))
+                log_masses += log_or_nothing(1 - earlier.detection(states))
             return states, log_masses + jnp.log(model.birth.rate / size)
 
         states, log_masses = jax.vmap(propose)(split(key, is_there.shape[0]), fill_missing(scan))
@@ -239,11 +268,13 @@ class Associate(AbstractWrapper):
         of_each = intensity.of_owners(jnp.zeros_like(components).at[order].set(components))
         stays = components[:most] > 0
         labels = jnp.pad(memory["labels"][1:], (0, len(order) - most))[order][:most]
-        starts = stays & (labels == 0)
-        upto = jnp.cumsum(starts, dtype=jnp.int32)
-        labels = jnp.where(starts, memory["next_label"] + upto - 1, jnp.where(stays, labels, 0))
+        is_new = stays & (labels == 0)
+        upto = jnp.cumsum(is_new, dtype=jnp.int32)
+        labels = jnp.where(is_new, memory["next_label"] + upto - 1, jnp.where(stays, labels, 0))
+        starts = jnp.where(stays, intensity.starts[order][:most], 0)
         return of_each, {
             "number": jnp.sum(intensity.masses),
+            "starts": jnp.pad(starts, (1, 0)),
             "labels": jnp.pad(labels, (1, 0)),
             "next_label": memory["next_label"] + upto[-1],
             "crowded_out": jnp.sum(jnp.where(is_probable, existence[order], 0.0)[most:]),
@@ -258,7 +289,13 @@ class Associate(AbstractWrapper):
         of_each, memory = self._assign_components(mixture.memory[TARGETS], intensity, most)
         key_first, key_rest = split(key, 2)
         undetected = jnp.where(of_each == 0, intensity.masses, 0.0)
-        (parents,), (masses,) = _redrawn(key_first, undetected[None], size)
+        references = _references(intensity)
+        # Half of them as the objects are, half as newborn ones, so that no place is left without.
+        chances = _normalised(undetected) + _normalised(references)
+        (drawn,), (shares,) = _redrawn(key_first, jax.lax.stop_gradient(chances)[None], size)
+        shares /= jax.lax.stop_gradient(jnp.where(chances > 0, chances, 1.0))[drawn]
+        masses = shares * undetected[drawn]
+        memory["references"] = _normalised(shares * references[drawn])
         objects = ParticleMixture(
             particles=intensity.states,
             log_weights=log_or_nothing(jnp.where(of_each > 0, intensity.masses, 0.0)),
@@ -272,26 +309,36 @@ class Associate(AbstractWrapper):
         def join(first: Array, others: Array) -> Array:
             return jnp.concatenate([first, others[:rest]])
 
-        first = jax.tree.map(lambda leaf: take(leaf, parents), intensity.states)
+        first = jax.tree.map(lambda leaf: take(leaf, drawn), intensity.states)
+        number = memory["number"]
         log_masses = join(log_or_nothing(masses), objects.log_weights)
+        # Without any object to expect, the weights are still a distribution.
+        log_none = jnp.where(jnp.arange(mixture.num_particles) < size, -jnp.log(size), -jnp.inf)
+        log_weights = log_masses - jnp.log(jnp.where(number > 0, number, 1.0))
         return mixture.replace(
             particles=jax.tree.map(join, first, objects.particles),
-            log_weights=log_masses - log_or_nothing(memory["number"]),
-            component_indicators=join(jnp.zeros_like(parents), objects.component_indicators),
+            log_weights=jnp.where(number > 0, log_weights, log_none.astype(log_weights.dtype)),
+            component_indicators=join(jnp.zeros_like(drawn), objects.component_indicators),
             ancestor_indices=no_ancestors(mixture),
             log_scale=mixture.log_scale + intensity.log_evidence,
             memory=mixture.memory | {TARGETS: memory},
         )
 
 
-def _once_each(mixture: ParticleMixture, number: Float[Array, ""]) -> Int[Array, " n"]:
-    """The component of each particle, after one that describes a more probable object joins it."""
+def _once_each(
+    mixture: ParticleMixture, number: Float[Array, ""], starts: Int[Array, " m"]
+) -> Int[Array, " n"]:
+    """The component of each particle, after one that describes a more probable object joins it.
+
+    Not two that the last scan of a sensor revealed: an object has one measurement in it.
+    """
     existence = number * mixture.mixture_weights
     means = flatten_states(mixture.component_means())
     variances = jnp.diagonal(mixture.component_covariances(), axis1=1, axis2=2)
     pooled = (variances[:, None] + variances[None]) / 2
     pairs = jnp.all((means[:, None] - means[None]) ** 2 < _SAME**2 * pooled, axis=2)
     pairs &= existence[:, None] + existence[None] <= 1
+    pairs &= (starts[:, None] != starts[None]) | (starts == 0)[None]
     pairs = jnp.triu(pairs, 1).at[0].set(False)
     pairs &= jnp.cumsum(pairs, axis=0) == 1  # each joins the most probable one
     pairs &= ~jnp.any(pairs, axis=0)[:, None]  # which does not join another
@@ -299,6 +346,47 @@ def _once_each(mixture: ParticleMixture, number: Float[Array, ""]) -> Int[Array,
     places = jnp.arange(len(pairs), dtype=jnp.int32)
     choice = jnp.argmax(pairs, axis=0).astype(jnp.int32)
     return take(jnp.where(jnp.any(pairs, axis=0), choice, places), mixture.component_indicators)
+
+
+def _density_at(
+    log_odds: Float[Array, "v k"], detection: Float[Array, " v"], before: _Intensity
+) -> tuple[Float[Array, " k"], Bool[Array, " k"]]:
+    """How many times as many old undetected objects as newborn ones are at each measurement.
+
+    An average over the nearest particles, by the sensor's own measure of what is near: log N(y_j|x)
+    divided by a number. And whether so many particles are at the measurement itself that an object
+    begins better at these.
+    """
+    own = len(log_odds)
+    references = before.references[:own, None]
+    log_odds = jax.lax.stop_gradient(jnp.where(references > 0, log_odds, -jnp.inf))
+    highest = jnp.max(log_odds, axis=0)
+    gaps = jnp.where(jnp.isfinite(highest), highest, 0.0)[None] - log_odds
+    gaps = jnp.minimum(gaps, _FAR)
+    reach = -jax.lax.top_k(-gaps.T, min(_NEAREST, own))[0][:, -1] / 2
+    near = references * exp(-gaps / jnp.maximum(reach, 1.0)[None])
+    there = jax.lax.stop_gradient(before.masses[:own] * detection)[:, None] * exp(-gaps)
+    is_dense = jnp.sum(there, axis=0) ** 2 >= _ENOUGH * jnp.sum(there**2, axis=0)
+    return before.densities @ _normalised(near), is_dense & jnp.any(there > 0, axis=0)
+
+
+def _references(intensity: _Intensity) -> Float[Array, " p"]:
+    """The masses of all particles as draws of one newborn object, undetected ones in two halves.
+
+    Each half counts by its objects, so that where all places are alike, so are their densities.
+    """
+    own, first = intensity.num_undetected // 2, intensity.num_undetected
+    is_old = jnp.arange(first) < own
+    masses = jnp.where(intensity.references > 0, intensity.masses[:first], 0.0)
+    shares = _normalised(jax.ops.segment_sum(masses, is_old.astype(jnp.int32), 2))
+    references = intensity.references * jnp.where(is_old, shares[1], shares[0])
+    return jnp.pad(jax.lax.stop_gradient(references), (0, len(intensity.masses) - first))
+
+
+def _normalised(masses: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """The masses over their sum, or zero."""
+    total = jnp.sum(masses, axis=0)
+    return masses / jnp.where(total > 0, total, 1.0)
 
 
 def _redrawn(

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
@@ -102,6 +102,12 @@ class GaussianRegeneration(AbstractResampling):
         """The part of the state that is redrawn."""
         return particles if self.where is None else self.where(particles)
 
+    def _corrected(
+        self, covariances: Float[Array, "m d d"], mixture: ParticleMixture
+    ) -> Float[Array, "m d d"]:
+        """Σ_m as they are drawn from; a subclass may correct them."""
+        return covariances
+
     def _draw(
         self,
         key: Key[Array, ""],
@@ -119,7 +125,8 @@ class GaussianRegeneration(AbstractResampling):
         states = jnp.where(mixture.occupied[:, None], states - centre[None], 0.0)
         weights = mixture.component_weights.astype(states.dtype)
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
-        factors = spread(cholesky(moments.covariances), vacated.component_indicators)
+        covariances = self._corrected(moments.covariances, mixture)
+        factors = spread(cholesky(covariances), vacated.component_indicators)
         labels, num_components = vacated.component_indicators, mixture.num_components
         noise = draw_noise(key, self.noise, states.shape, states.dtype, labels, num_components)
         offsets = jnp.einsum("nij,nj->ni", factors, noise)
