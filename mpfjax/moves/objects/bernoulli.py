@@ -385,7 +385,7 @@ def _references(intensity: _Intensity) -> Float[Array, " p"]:
 
 def _normalised(masses: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """The masses over their sum, or zero."""
-    total = jnp.sum(masses, axis=0)
+    total = jnp.sum(masses, axis=0, keepdims=True)
     return masses / jnp.where(total > 0, total, 1.0)
 
 
