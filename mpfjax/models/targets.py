@@ -46,7 +46,9 @@ class TargetsModel(AbstractStateSpaceModel, Fitting):
     that every object was missed; a step with all sensors off is a missing one, see `Series`, and a
     single one that is off has p_D = 0. u_t reaches the sensors, and the birth and p_S if they have
     a field `inputs`: a rate may depend on the time since the last scan. log L(y_t | x) assumes that
-    x is the only object. Raises `ValueError` for numbers outside these ranges and other sensors.
+    x is the only object. A derivative at p_D = 1 is that of one scan: no particle of a missed
+    object is left for later ones. Raises `ValueError` for numbers outside these ranges and other
+    sensors.
     """
 
     sensors: tuple[ClutteredModel, ...] = eqx.field(converter=_as_sensors)
