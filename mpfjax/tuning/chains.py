@@ -150,7 +150,7 @@ class Sampling(Checked):
         last = self.burn_in + num_draws * self.thinning
         run = LongRun(self.caller, last, self.checkpoint, self.progress, lambda step: identity)
         key_starts, key_steps = jax.random.split(self.key)
-        chains, none = self._started(kernel, key_starts)
+        chains, none = self._start_chains(kernel, key_starts)
         advance = self._advance(kernel, key_steps, none)
         state, stopped = run.go(State(0, chains, none), advance)
         reals, *rest = jax.tree.map(lambda rows: np.moveaxis(rows[:num_draws], 0, 1), state.rows)
@@ -179,7 +179,7 @@ class Sampling(Checked):
         keys = jax.random.split(key, num)
         return _start_all(kernel, keys, reals, random_walk(self.deviations, reals))
 
-    def _started(self, kernel: AbstractKernel, key: Key[Array, ""]) -> tuple[Chains, PyTree]:
+    def _start_chains(self, kernel: AbstractKernel, key: Key[Array, ""]) -> tuple[Chains, PyTree]:
         """All chains at their starts, and reports of no steps.
 
         A draw of the prior at which a chain cannot start is drawn again.

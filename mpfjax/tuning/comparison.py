@@ -78,7 +78,7 @@ def compare_evidence(models: Mapping[str, Runs]) -> Comparison:
             if not np.isfinite(evidence[name]).all():
                 raise ValueError(f"models: one run of {name} gives no error; give several runs")
             continue
-        evidence[name] = _pooled(name, [
+        evidence[name] = _pool(name, [
             run.log_marginal_likelihood if isinstance(run, SequentialPosterior) else float(run)
             for run in runs
         ])  # fmt: skip
@@ -89,7 +89,7 @@ def compare_evidence(models: Mapping[str, Runs]) -> Comparison:
     return Comparison(values, errors)
 
 
-def _pooled(name: str, estimates: Sequence[float]) -> tuple[float, float]:
+def _pool(name: str, estimates: Sequence[float]) -> tuple[float, float]:
     """The logarithm of the mean of unbiased estimates, given by theirs, and its standard error."""
     values = np.asarray(estimates, float)
     if values.ndim != 1 or len(values) < 2 or not np.isfinite(values).all():

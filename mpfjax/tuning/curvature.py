@@ -120,7 +120,7 @@ def _informations(
     shortest = _FEWEST_PLACES * np.asarray(np.spacing(np.abs(centre)), float)
 
     def column(axis: int) -> Float[np.ndarray, "seeds d"]:
-        """That of every seed, by differences over about one standard error.
+        """A column for every seed, by differences over about one standard error.
 
         So far the likelihood tells the points apart, and the noise matters least.
         """

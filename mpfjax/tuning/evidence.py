@@ -19,7 +19,7 @@ from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.history import mixtures_of
 from mpfjax.smoothing.trajectories import draw_trajectories
-from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, placed, pose
+from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, places_of, pose
 
 UnbiasedFilter = Annotated[
     Filter,
@@ -61,7 +61,7 @@ class LogEvidence(eqx.Module):
         return parts if rng is None else [parts[k] for k in rng.permutation(len(parts))]
 
     def part(self, group: int, rows: np.ndarray) -> "LogEvidence":
-        """That of some sequences of one group."""
+        """The evidence of some sequences of one group."""
         return type(self)([jax.tree.map(lambda leaf: leaf[rows], self.groups[group])])
 
     def runs(self, key: Key[Array, ""], filter: Filter, whole: bool = False) -> list[FilterRun]:
@@ -181,7 +181,7 @@ def names_but_proposals(problem: Problem) -> list[str]:
     def is_proposal(node: Any) -> bool:
         return isinstance(node, AbstractProposal)
 
-    nodes = jax.tree.leaves(placed(problem.tree), is_leaf=is_proposal)
+    nodes = jax.tree.leaves(places_of(problem.tree), is_leaf=is_proposal)
     places = jax.tree.leaves(list(filter(is_proposal, nodes)))
     return [name for name, index in problem.tuned if Place(index) not in places]
 

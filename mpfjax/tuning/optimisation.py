@@ -234,7 +234,7 @@ class _Ascent:
         settings |= {"batch": self.batch, "pooled": self.pooled} | self.problem.settings | data
 
         def first(reals: Reals) -> Any:
-            return self._updated(reals, self.optimizer.init(reals), reals)
+            return self._update(reals, self.optimizer.init(reals), reals)
 
         functions |= {"optimizer": (first, reals)}
         identity = identity_of(self.caller, checkpoint, settings, functions)
@@ -244,7 +244,7 @@ class _Ascent:
         key = jax.random.fold_in(self.key, state.step)
         try:
             values = np.concatenate([
-                self._evaluated(jax.random.fold_in(key, number), part, reals)[0]
+                self._evaluate(jax.random.fold_in(key, number), part, reals)[0]
                 for number, part in enumerate(self.parts())
             ], axis=1)  # fmt: skip
             value = self._average(values)
@@ -287,7 +287,7 @@ class _Ascent:
             return float(values.mean(axis=0).sum())
         return float((np.logaddexp.reduce(values, axis=0) - np.log(len(values))).sum())
 
-    def _evaluated(
+    def _evaluate(
         self, key: Key[Array, ""], problem: Problem, reals: Reals
     ) -> tuple[Float[np.ndarray, "seeds series"], Reals]:
         """The objective of each seed, and the gradient of their average; `Broken` if not finite."""
@@ -305,20 +305,20 @@ class _Ascent:
         """One step up."""
         reals, optimizer = carry
         problem, factor = self._at_step(step)
-        values, gradient = self._evaluated(jax.random.fold_in(self.key, step), problem, reals)
+        values, gradient = self._evaluate(jax.random.fold_in(self.key, step), problem, reals)
         idle = [name for name, leaf in gradient.items() if not np.asarray(leaf).any()]
         if step == 0 and idle:
             what = f"the {self.objective} does not depend on {', '.join(idle)}"
             raise ValueError(f"parameters: {what}")
         gradient = jax.tree.map(lambda leaf: factor * leaf, gradient)
-        updated, optimizer = self._updated(gradient, optimizer, reals)
+        updated, optimizer = self._update(gradient, optimizer, reals)
         deviation = np.sqrt(factor) * values.sum(axis=1).std()
         effective = _effective_seeds(values).mean()
         row = factor * self._average(values), deviation, effective, reals
         row = jax.tree.map(lambda leaf: np.asarray(leaf)[None], row)
         return step + 1, (updated, optimizer), row
 
-    def _updated(self, gradient: Reals, optimizer: PyTree, reals: Reals) -> tuple[Reals, PyTree]:
+    def _update(self, gradient: Reals, optimizer: PyTree, reals: Reals) -> tuple[Reals, PyTree]:
         """One step of the optimiser."""
         descent = jax.tree.map(jnp.negative, gradient)
         # Optimisers need JAX's default promotion, whatever the caller has set.

@@ -104,13 +104,13 @@ def _reweight(
 
 
 @jit_on_wide_vectors
-def started(keys, sampler, reals):
+def start(keys, sampler, reals):
     """The samples as particles of equal weight, in one component."""
     return single_component(jax.vmap(sampler.start)(keys, reals))
 
 
 @jit_on_wide_vectors
-def extended(key, sampler, samples, t):
+def extend(key, sampler, samples, t):
     """All samples after one more observation, weighted by it.
 
     A θ whose likelihood is no number gets the weight zero, and keeps it.
@@ -122,7 +122,7 @@ def extended(key, sampler, samples, t):
 
 
 @jit_on_wide_vectors
-def rejuvenated(key, sampler, samples, num_steps):
+def rejuvenate(key, sampler, samples, num_steps):
     """Samples of equal weight, from chains that start at resampled ones.
 
     Also from which sample each comes, the share of accepted steps, and how often a density was no
@@ -162,7 +162,7 @@ def rejuvenated(key, sampler, samples, num_steps):
 
 
 @jit_on_wide_vectors
-def exchanged(key, sampler, samples, num_steps):
+def exchange(key, sampler, samples, num_steps):
     """The samples with filters of this sampler's number of particles, weighted by what they change.
 
     The exchange step by importance sampling of Chopin, Jacob and Papaspiliopoulos (2013, section

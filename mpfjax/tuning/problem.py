@@ -170,7 +170,7 @@ class Place:
     index: int
 
 
-def placed(tree: PyTree) -> PyTree:
+def places_of(tree: PyTree) -> PyTree:
     """The tree with a `Place` for each leaf."""
     leaves, structure = jax.tree.flatten(tree)
     return jax.tree.unflatten(structure, map(Place, range(len(leaves))))
@@ -189,7 +189,7 @@ def _places_of(tree: PyTree, parameters: Parameters) -> dict[str, int]:
     """Each parameter's name, and its place among the tree's leaves."""
     if parameters is None:
         parameters = {"": lambda tree: getattr(tree, "model", tree)}
-    leaves, places = jax.tree.leaves(tree), placed(tree)
+    leaves, places = jax.tree.leaves(tree), places_of(tree)
     tuned: dict[str, int] = {}
     for name, where in parameters.items():
         for inner, index in _pick(name, where, places, leaves).items():

@@ -14,7 +14,7 @@ from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identit
 from mpfjax.tuning.chains import warn_of_invalid
 from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn
 from mpfjax.tuning.evidence import UnbiasedFilter, one_sequence, pose_evidence, with_present
-from mpfjax.tuning.parameter_particles import Sampler, exchanged, extended, rejuvenated, started
+from mpfjax.tuning.parameter_particles import Sampler, exchange, extend, rejuvenate, start
 from mpfjax.tuning.problem import Parameters, Problem, Transforms
 from mpfjax.tuning.summaries import numbers_of, row_of, table
 
@@ -211,14 +211,14 @@ def smc2(
     reals = drawn(key_prior, problem, sample_prior, num_samples)
     first = jax.tree.map(lambda u: u[0], reals)
     prior = checked_prior(log_prior, problem, key_prior, sample_prior)
-    sampler = Sampler(problem, _padded(series, series.length), prior, int(num_moves))
+    sampler = Sampler(problem, _pad(series, series.length), prior, int(num_moves))
     settings = problem.settings | {
         "key": key, "num_samples": int(num_samples), "num_moves": int(num_moves),
         "max_particles": max_particles,
     }  # fmt: skip
     identity = identity_of("smc2", checkpoint, settings, {"log_prior": (prior, first)})
     run = _Run(sampler, series, key_steps, max_particles, checkpoint, progress, identity)
-    samples = started(jax.random.split(key_filters, num_samples), sampler, reals)
+    samples = start(jax.random.split(key_filters, num_samples), sampler, reals)
     num_invalid = {"log_prior": 0, "log_marginal_likelihood": 0}
     carry = samples, np.arange(num_samples), problem.tree.num_particles, num_invalid
     rows = np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64)
@@ -244,7 +244,7 @@ class _Run:
     identity: dict[str, str]
 
     def followed_by(self, step: int, observations: PyTree, progress: bool) -> "_Run":
-        """The same with the observations that come after a step, and no others."""
+        """The run with the observations that come after a step, and no others."""
         before = jax.tree.map(lambda leaf: leaf[:step], self.series)
         after = jax.tree.map(
             np.asarray, one_sequence(observations, self.sampler.problem.tree.model)
@@ -260,7 +260,7 @@ class _Run:
         # With room for as many more, so that observations that come one by one share a program.
         if series.length > capacity:
             capacity = max(series.length, 2 * capacity)
-        sampler = replace(self.sampler, series=_padded(series, capacity))
+        sampler = replace(self.sampler, series=_pad(series, capacity))
         return replace(self, sampler=sampler, series=series, progress=progress)
 
     def posterior(self, start: State) -> SequentialPosterior:
@@ -290,7 +290,7 @@ class _Run:
         samples, families, num_particles, invalid = carry
         counts, sampler = dict(invalid), self.sampler.with_particles(num_particles)
         keys = jax.random.split(jax.random.fold_in(self.key, step), 3)
-        samples, *numbers = extended(keys[0], sampler, samples, jnp.asarray(step, jnp.int32))
+        samples, *numbers = extend(keys[0], sampler, samples, jnp.asarray(step, jnp.int32))
         increment, size, num_invalid = map(float, numbers)
         counts["log_marginal_likelihood"] += int(num_invalid)
         rate = np.nan
@@ -299,14 +299,14 @@ class _Run:
             raise Broken(f"no sample has any likelihood{broken}")
         if size < _ESS_THRESHOLD * samples.num_particles:
             so_far = jnp.asarray(step + 1, jnp.int32)
-            samples, ancestors, *report = rejuvenated(keys[1], sampler, samples, so_far)
+            samples, ancestors, *report = rejuvenate(keys[1], sampler, samples, so_far)
             families, (accepted, of_moves) = families[np.asarray(ancestors)], report
             rate = float(accepted)
             counts = {name: count + int(of_moves[name]) for name, count in counts.items()}
             may_double = self.max_particles is not None and 2 * num_particles <= self.max_particles
             if may_double and rate < _ACCEPTANCE_THRESHOLD:
                 larger = self.sampler.with_particles(2 * num_particles)
-                with_larger, gain, _, dropped = exchanged(keys[2], larger, samples, so_far)
+                with_larger, gain, _, dropped = exchange(keys[2], larger, samples, so_far)
                 counts["log_marginal_likelihood"] += int(dropped)
                 # Where no filter of 2N particles has any likelihood, those of N are kept.
                 if float(gain) > -np.inf:
@@ -316,7 +316,7 @@ class _Run:
         return step + 1, (samples, families, num_particles, counts), tuple(row)
 
 
-def _padded(series: Series, capacity: int) -> Series:
+def _pad(series: Series, capacity: int) -> Series:
     """The data in arrays of JAX with room for this many steps."""
 
     def pad(leaf: np.ndarray) -> Array:

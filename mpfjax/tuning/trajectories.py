@@ -175,7 +175,7 @@ def states_of(
 
 
 def _in_numpy(tree: PyTree) -> PyTree:
-    """The same in arrays of numpy."""
+    """The tree in arrays of numpy."""
     return jax.tree.map(np.asarray, tree)
 
 

@@ -42,14 +42,9 @@ ALLOWED_FUNCTIONS = {
     "robots/maps.py": {"tabulated"},
     "robots/motion.py": {"interpolated_poses"},
     "robots/pose.py": {"localised"},
-    "tuning/chains.py": {"_started"},
-    "tuning/comparison.py": {"_pooled"},
     "tuning/densities.py": {"evaluated"},
     "tuning/gibbs.py": {"changed"},
-    "tuning/optimisation.py": {"_evaluated", "_updated"},
-    "tuning/parameter_particles.py": {"exchanged", "extended", "rejuvenated", "started"},
-    "tuning/problem.py": {"placed"},
-    "tuning/sequential.py": {"_padded", "followed_by", "resampled"},
+    "tuning/sequential.py": {"followed_by", "resampled"},
     "tuning/walks.py": {"adapted"},
 }
 

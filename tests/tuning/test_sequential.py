@@ -75,14 +75,14 @@ def assert_same_samples(one, other):
 
 def interrupt_at(monkeypatch, step):
     """Ctrl-C at an observation."""
-    real = observing.extended
+    real = observing.extend
 
     def interrupted(sampler, key, samples, t):
         if int(t) == step:
             raise KeyboardInterrupt
         return real(sampler, key, samples, t)
 
-    monkeypatch.setattr(observing, "extended", interrupted)
+    monkeypatch.setattr(observing, "extend", interrupted)
 
 
 @pytest.mark.weekly
