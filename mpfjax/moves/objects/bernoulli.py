@@ -357,15 +357,15 @@ def _density_at(
     divided by a number. And whether so many particles are at the measurement itself that an object
     begins better at these.
     """
-    own = len(log_odds)
-    references = before.references[:own, None]
+    num_old = len(log_odds)
+    references = before.references[:num_old, None]
     log_odds = jax.lax.stop_gradient(jnp.where(references > 0, log_odds, -jnp.inf))
     highest = jnp.max(log_odds, axis=0)
     gaps = jnp.where(jnp.isfinite(highest), highest, 0.0)[None] - log_odds
     gaps = jnp.minimum(gaps, _FAR)
-    reach = -jax.lax.top_k(-gaps.T, min(_NEAREST, own))[0][:, -1] / 2
+    reach = -jax.lax.top_k(-gaps.T, min(_NEAREST, num_old))[0][:, -1] / 2
     near = references * exp(-gaps / jnp.maximum(reach, 1.0)[None])
-    there = jax.lax.stop_gradient(before.masses[:own] * detection)[:, None] * exp(-gaps)
+    there = jax.lax.stop_gradient(before.masses[:num_old] * detection)[:, None] * exp(-gaps)
     is_dense = jnp.sum(there, axis=0) ** 2 >= _ENOUGH * jnp.sum(there**2, axis=0)
     return before.densities @ _normalised(near), is_dense & jnp.any(there > 0, axis=0)
 
@@ -375,8 +375,8 @@ def _references(intensity: _Intensity) -> Float[Array, " p"]:
 
     Each half counts by its objects, so that where all places are alike, so are their densities.
     """
-    own, first = intensity.num_undetected // 2, intensity.num_undetected
-    is_old = jnp.arange(first) < own
+    num_old, first = intensity.num_undetected // 2, intensity.num_undetected
+    is_old = jnp.arange(first) < num_old
     masses = jnp.where(intensity.references > 0, intensity.masses[:first], 0.0)
     shares = _normalised(jax.ops.segment_sum(masses, is_old.astype(jnp.int32), 2))
     references = intensity.references * jnp.where(is_old, shares[1], shares[0])

@@ -25,9 +25,9 @@ class _ByRoot(Resample):
     ) -> Int[Array, " m"]:
         """How many slots each component receives."""
         demands, _ = scaled_exp(jnp.where(due, _POWER * line.log_masses, -jnp.inf))
-        kept = jnp.zeros_like(due, jnp.int32)
+        unchanged = jnp.zeros_like(due, jnp.int32)
         each = self.particles_per_component
-        return allocate_slots(kept, due, mixture.num_usable_slots, each, demands)
+        return allocate_slots(unchanged, due, mixture.num_usable_slots, each, demands)
 
 
 class RegenerateObjects(GaussianRegeneration):
@@ -42,7 +42,7 @@ class RegenerateObjects(GaussianRegeneration):
     def _resample(self) -> Resample:
         return _ByRoot(particles_per_component=self.particles_per_component)
 
-    def _corrected(
+    def _correct(
         self, covariances: Float[Array, "m d d"], mixture: ParticleMixture
     ) -> Float[Array, "m d d"]:
         sizes = jnp.maximum(mixture.component_effective_sample_sizes, 2.0)

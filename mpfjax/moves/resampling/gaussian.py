@@ -102,7 +102,7 @@ class GaussianRegeneration(AbstractResampling):
         """The part of the state that is redrawn."""
         return particles if self.where is None else self.where(particles)
 
-    def _corrected(
+    def _correct(
         self, covariances: Float[Array, "m d d"], mixture: ParticleMixture
     ) -> Float[Array, "m d d"]:
         """Σ_m as they are drawn from; a subclass may correct them."""
@@ -125,7 +125,7 @@ class GaussianRegeneration(AbstractResampling):
         states = jnp.where(mixture.occupied[:, None], states - centre[None], 0.0)
         weights = mixture.component_weights.astype(states.dtype)
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
-        covariances = self._corrected(moments.covariances, mixture)
+        covariances = self._correct(moments.covariances, mixture)
         factors = spread(cholesky(covariances), vacated.component_indicators)
         labels, num_components = vacated.component_indicators, mixture.num_components
         noise = draw_noise(key, self.noise, states.shape, states.dtype, labels, num_components)
