@@ -124,7 +124,7 @@ def sample_trajectories(
 
 def _check_component(mixtures: ParticleMixture, component: int) -> None:
     active = jax.tree.map(lambda leaf: leaf[-1], mixtures).active
-    alive = range(component + 1) if isinstance(active, Tracer) else np.flatnonzero(active)
+    alive = range(component + 1) if isinstance(active, Tracer) else np.flatnonzero(active).tolist()
     if component not in alive:
         raise ValueError(f"component: {component} is empty at the last step; active are {[*alive]}")
 

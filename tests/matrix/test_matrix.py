@@ -9,9 +9,9 @@ import warnings
 
 import pytest
 
-from tests.marking import quick_of
+from tests.marking import quick_of, weekly
 from tests.matrix.data import FOR
-from tests.matrix.filters import FILTERS, MOVES, PAIRS, RECIPES, SINGLE
+from tests.matrix.filters import FILTERS, MOVES, PAIRS, RECIPES, SINGLE, parts
 from tests.matrix.models import FORMS
 from tests.matrix.page import PAGE, page
 from tests.matrix.questions import OF_RUNS, OTHERS, QUESTIONS, Row
@@ -78,7 +78,13 @@ def test_filters(form, filter):
 OF_PAIRS = [(form, pair) for pair in PAIRS for form in ("inputs", "conditionally linear")]
 
 
-@pytest.mark.parametrize(("form", "pair"), quick_of(OF_PAIRS, [], one_in=20))
+# Compiling a start takes half a minute.
+SLOW = {"start", "restarts"}
+WEEKLY = [(form, pair) for form, pair in OF_PAIRS if SLOW & parts(pair)]
+OTHER_PAIRS = [cell for cell in OF_PAIRS if cell not in WEEKLY]
+
+
+@pytest.mark.parametrize(("form", "pair"), [*quick_of(OTHER_PAIRS, [], one_in=20), *weekly(WEEKLY)])
 def test_pairs_of_transforms(form, pair):
     """In either order."""
     check(form, pair, cells(GAPS, OF_RUNS))

@@ -87,7 +87,11 @@ def test_scans_with_infinities_are_the_models_or_are_counted(recwarn):
     ("data", "options", "named"),
     [
         (Series(HOLED, present=np.arange(len(HOLED)) != 2), {}, "observations: NaN .* index 1"),
-        (Series(OBSERVATIONS, INPUTS), {"inputs": INPUTS}, "observations: a Series says itself"),
+        (
+            Series(OBSERVATIONS, INPUTS),
+            {"inputs": INPUTS},
+            "observations: a Series itself",
+        ),
     ],
 )
 def test_what_would_be_run_as_something_else_is_refused(data, options, named):

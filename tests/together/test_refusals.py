@@ -479,9 +479,9 @@ REFUSED = (
     # smoothing
     ("observations: .3. steps", lambda: paths(
         run_of(SWITCHING, TWO[:, None]), SWITCHING, observations=THREE[:, None])),
-    ("component: 1 is dead",
+    ("component: 1 is empty",
      lambda: paths(run(Filter(MODEL, [Propagate()], 4, 2)), component=1)),
-    ("mixtures: these are not all", lambda: paths(HISTORY.final)),
+    ("mixtures: not those of a whole run", lambda: paths(HISTORY.final)),
     (r"mixtures: \[ParticleMixture\(particles=f32\[4\], .* is not", lambda: paths([MIXTURE])),
     (r"q: 90 is not in \[0, 1\]", lambda: MIXTURE.quantile(MIXTURE.particles, 90)),
     (r"trajectory: float32\[4\] is not float32\[3\]", lambda: around(trajectory=np.ones(4))),
