@@ -15,7 +15,19 @@ from mpfjax.vision.tracking.associate import (
     probabilities,
     unlikeness,
 )
-from mpfjax.vision.tracking.gaussian import Gaussian, overlap
+from mpfjax.vision.tracking.gaussian import Gaussian, overlapping
+from mpfjax.vision.tracking.pairs import Pairs
+
+
+def possible(values):
+    """The pairs of a matrix of costs, of which those that are infinite are none."""
+    return Pairs.of(values, np.isfinite(values))
+
+
+def matrix(pairs, none):
+    values = np.full(pairs.shape, none)
+    values[pairs.rows, pairs.columns] = pairs.values
+    return values
 
 
 def brute_force(odds):
@@ -52,7 +64,9 @@ def test_lone_pairs_and_those_with_rivals_have_the_marginals_of_all():
     rng = np.random.default_rng(3)
     cost = rng.normal(-2, 5, (9, 8))
     cost[rng.uniform(0, 1, (9, 8)) > 0.2] = np.inf
-    np.testing.assert_allclose(probabilities(cost), marginals(-cost / 4), atol=1e-6)
+    pairs = possible(cost)
+    probability = matrix(pairs._replace(values=probabilities(pairs)), 0.0)
+    np.testing.assert_allclose(probability, marginals(-cost / 4), atol=1e-6)
 
 
 def test_marginals_of_large_odds_are_those_of_all_assignments():
@@ -75,13 +89,13 @@ def test_the_assignment_has_the_least_total_cost():
         ways = itertools.product(range(-1, 5), repeat=4)
         apart = (way for way in ways if len({c for c in way if c >= 0}) == sum(c >= 0 for c in way))
         expected = min(sum(cost[r, c] for r, c in enumerate(way) if c >= 0) for way in apart)
-        source = one_to_one(cost)
+        source = one_to_one(possible(cost))
         taken = source[source >= 0]
         assert len(set(taken)) == len(taken)
         assert cost[source >= 0, taken].sum() == pytest.approx(expected)
-    tied = one_to_one(np.full((3, 2), -0.5))
+    tied = one_to_one(possible(np.full((3, 2), -0.5)))
     assert sorted(tied.tolist()) == [-1, 0, 1]
-    assert one_to_one(np.full((3, 2), np.inf)).tolist() == [-1, -1, -1]
+    assert one_to_one(possible(np.full((3, 2), np.inf))).tolist() == [-1, -1, -1]
 
 
 def test_a_pairs_cost_is_students_density_in_boxes():
@@ -94,7 +108,7 @@ def test_a_pairs_cost_is_students_density_in_boxes():
     moments = Gaussian(place, place * 0, variances, place, place)
     seen = place[:, None] + rng.normal(0, 0.5, (2, 3, 4))
     beside = rng.uniform(-3, 1, (2, 3))
-    cost = mahalanobis(moments, errors, seen[0], beside)
+    cost = matrix(mahalanobis(moments, errors, seen[0], beside), np.inf)
     for m in range(2):
         unit = np.array([*np.exp(place[m, 2:]), 1, 1])
         total = variances[m] / unit**2 + errors**2
@@ -104,16 +118,17 @@ def test_a_pairs_cost_is_students_density_in_boxes():
         np.testing.assert_allclose(cost[m], expected + beside[m], rtol=1e-9)
 
 
-def test_pairs_that_are_left_out_by_x_alone_cost_more_than_none():
+def test_pairs_that_are_left_out_by_x_or_y_alone_cost_more_than_none():
     rng = np.random.default_rng(0)
     place = np.c_[rng.uniform(0, 300, (40, 2)), rng.normal(3, 0.1, (40, 2))]
     moments = Gaussian(place, place, rng.uniform(0.01, 9, (40, 4)), place, place)
     beside = rng.uniform(-3, 1, (40, 40))
-    cost = mahalanobis(moments, np.full(4, 0.05), place + 0.2, beside)
+    errors, seen = np.full(4, 0.05), place + 0.2
+    cost = matrix(mahalanobis(moments, errors, seen, beside), np.inf)
     # Where pairs cost so much less beside distance, none is left out.
-    unlimited = mahalanobis(moments, np.full(4, 0.05), place + 0.2, beside - 4e3) + 4e3
+    unlimited = matrix(mahalanobis(moments, errors, seen, beside - 4e3), np.inf) + 4e3
     near = np.isfinite(cost)
-    assert 40 < near.sum() < 1500
+    assert 40 < near.sum() < 1300
     np.testing.assert_allclose(cost[near], unlimited[near], atol=1e-6)
     assert (unlimited[~near] >= 0).all()
 
@@ -121,7 +136,7 @@ def test_pairs_that_are_left_out_by_x_alone_cost_more_than_none():
 def test_a_very_wide_prediction_still_forms_a_pair_with_what_lies_at_it():
     place = np.zeros((1, 4))
     wide = Gaussian(place, place, place + 1e4, place, place)
-    assert float(mahalanobis(wide, np.zeros(4) + 0.1, place, np.zeros((1, 1)))[0, 0]) < 0
+    assert mahalanobis(wide, np.zeros(4) + 0.1, place, np.zeros((1, 1))).values[0] < 0
 
 
 def test_colours_cost_by_their_distance_and_nothing_where_they_are_not_known():
@@ -153,4 +168,20 @@ def test_overlap_is_the_share_of_pixels():
         [(inside(one) & inside(other)).sum() / (inside(one) | inside(other)).sum() for other in b]
         for one in a
     ]
-    np.testing.assert_allclose(overlap(1.0 * a, 1.0 * b), expected, rtol=1e-12)
+    shares = matrix(overlapping(1.0 * a, 1.0 * b), 0.0)
+    np.testing.assert_allclose(shares, expected, rtol=1e-12)
+
+
+def test_partners_have_each_others_largest_value_above_zero():
+    """Against a search of the whole matrix, in which some pairs are impossible."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        values = rng.normal(0.5, 1, (6, 4))
+        values[rng.uniform(size=values.shape) < 0.4] = -np.inf
+        columns = np.argmax(values, axis=1)
+        best = values[np.arange(6), columns]
+        is_mutual = (np.argmax(values, axis=0)[columns] == np.arange(6)) & (best > 0)
+        expected = np.where(is_mutual, columns, -1)
+        np.testing.assert_array_equal(possible(values).partners, expected)
+    nobody = Pairs.of(np.zeros((2, 0)), np.zeros((2, 0), bool))
+    assert nobody.partners.tolist() == [-1, -1]

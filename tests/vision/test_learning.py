@@ -13,6 +13,7 @@ from mpfjax.vision.tracking.camera import CameraState
 from mpfjax.vision.tracking.gaussian import Gaussian, units
 from mpfjax.vision.tracking.lives import Coasting, Duplicates, Spans
 from mpfjax.vision.tracking.noise import _GRID, NoiseState
+from mpfjax.vision.tracking.pairs import Pairs
 from mpfjax.vision.tracking.scores import ScoreState, rising
 
 M = 4
@@ -116,7 +117,7 @@ def test_each_candidate_is_a_filter_of_its_own_from_the_first_detection_on():
     seen += rng.normal(0, 0.05, seen.shape) * [2, 2, 1, 1]
     speed, nobody = np.array([0.1, 0.05, 0.05, 0.03]), Gaussian.none(4)
     state = NoiseState.initial(25.0)
-    state = state._replace(moments=state.newborns(seen[:1], speed))
+    state = state.renew(np.zeros(0, bool), seen[:1], speed)
     alone = [
         Gaussian.initial(seen[:1], units(seen[:1]) * r, units(seen[:1]) * speed)
         for r, _, _ in _GRID
@@ -131,6 +132,30 @@ def test_each_candidate_is_a_filter_of_its_own_from_the_first_detection_on():
     np.testing.assert_allclose(state.moments.place[0], expected, rtol=1e-12)
 
 
+def test_of_many_objects_the_eldest_tell_the_noises_and_others_follow_when_they_end():
+    rng = np.random.default_rng(0)
+    places = rng.uniform(1, 3, (300, 4))
+    state = NoiseState.initial(25.0).renew(np.zeros(0, bool), places, np.full(4, 0.1))
+    assert state.followed.tolist() == [True] * 128 + [False] * 172
+    stays = np.arange(300) % 2 == 0
+    state = state.renew(stays, places[:100] + 5, np.full(4, 0.1))
+    assert len(state.moments.place) == 128
+    assert state.followed.tolist() == [True] * 64 + [False] * 86 + [True] * 64 + [False] * 36
+    # Detections are those of the objects that are followed, wherever they stand among all.
+    columns = np.full(250, -1)
+    columns[[3, 100, 160]] = 0, 1, 2
+    seen = np.stack([places[6], places[200], places[10] + 5]) + 0.01
+    after = state.after(columns, seen, np.ones(250, bool), Gaussian.none(4))
+    moved = np.flatnonzero((after.moments.place != renewed_places(places)).any(axis=(1, 2)))
+    np.testing.assert_array_equal(moved, [3, 74])
+
+
+def renewed_places(places):
+    """Of the first 64 even ones of the objects, and of 64 new ones."""
+    at = np.concatenate([places[:128:2], places[:64] + 5])
+    return np.broadcast_to(at[:, None], (128, len(_GRID), 4))
+
+
 # --- the camera ----------------------------------------------------------------------------
 
 
@@ -142,7 +167,7 @@ def test_the_mean_product_of_innovations_is_the_cameras_variance(sigma, num_obje
     places = np.c_[100.0 * np.arange(num_objects), np.zeros((num_objects, 3))]
     small = np.full_like(places, 0.02)
     predicted = Gaussian(places, 0 * places, small, small, small)
-    cost = np.where(np.eye(num_objects, dtype=bool), -1.0, 1.0)
+    cost = Pairs.of(-np.eye(num_objects), np.eye(num_objects) > 0)
     camera, gone, kept = CameraState(), np.zeros((1, 2)), []
     for _ in range(600):
         gaps = rng.normal(0, sigma, 2) + rng.normal(0, 0.1, (num_objects, 2))
@@ -158,7 +183,7 @@ def test_a_shift_of_all_is_the_cameras_and_that_of_one_is_its_own():
     rows = np.c_[100.0 * np.arange(5), np.zeros((5, 3))]
     small = np.full_like(rows, 1e-4)
     predicted = Gaussian(rows, 0 * rows, small, small, small)
-    cost = np.where(np.eye(5, dtype=bool), -1.0, 1.0)
+    cost = Pairs.of(-np.eye(5), np.eye(5) > 0)
     camera = CameraState(np.full(2, 0.5), np.full(2, 0.5), 30.0)
     seen = rows + np.array([0.7, 0, 0, 0])
     seen[2, 1] += 3.0
@@ -190,7 +215,7 @@ def scored(frames, lasting=50):
     state = ScoreState.initial()
     for places, scores in frames:
         boxes = np.array([[*place, 10, 10] for place in places], float)
-        apart = np.eye(len(boxes))
+        apart = Pairs.of(np.eye(len(boxes)), np.eye(len(boxes)) > 0)
         state = state.after(boxes, np.asarray(scores, float), apart, state.boxes, 1.0, lasting)
     return state
 
@@ -248,7 +273,9 @@ def test_predictions_are_shown_for_as_long_as_they_were_right():
 
 def test_who_never_leaves_a_neighbour_before_it_ends_is_a_double():
     """Others that began beside an older one decide: most of them ended there, or went away."""
-    together, seen = np.array([[1.0, 0.4], [0.4, 1.0]]), np.ones(2, bool)
+    shares, seen = np.array([[1.0, 0.4], [0.4, 1.0]]), np.ones(2, bool)
+    together, apart = Pairs.of(shares, shares > 0), Pairs.of(shares, shares > 0.5)
+    one = Pairs.of(shares[:1, :1], seen[None, :1])
 
     def many(overlaps_before_the_end, ends):
         duplicates, lives_on = Duplicates(), np.zeros(0, bool)
@@ -260,12 +287,12 @@ def test_who_never_leaves_a_neighbour_before_it_ends_is_a_double():
             duplicates = duplicates.after(names, seen, seen, overlaps_before_the_end)
             if ends:
                 lone = np.array([True, False])
-                duplicates = duplicates.after(names[:1], lone, seen[:1], together[:1, :1])
+                duplicates = duplicates.after(names[:1], lone, seen[:1], one)
                 lives_on = seen[:1]
         return begun
 
     assert many(together, ends=True).doubtful.tolist() == [False, True]
-    assert not many(np.eye(2), ends=True).doubtful.any()
+    assert not many(apart, ends=True).doubtful.any()
 
 
 def test_pairs_of_the_cameras_motion_do_not_widen_with_its_deviation():

@@ -7,6 +7,7 @@ from scipy.special import expit
 
 from mpfjax.moves.objects.association import iterate_replies
 from mpfjax.vision.tracking.gaussian import Gaussian
+from mpfjax.vision.tracking.pairs import Pairs, intervals
 
 _FREEDOM = 4.0  # degrees, of Student's distribution of gaps
 _COLOUR_COST, _UNDECIDED = 14.0, 0.25  # of B², and where it is evidence neither for nor against
@@ -16,11 +17,10 @@ _WIDEST = -0.5  # log |S| counts as at most this: a detection at the prediction 
 TEMPERATURE = 2.0  # above 1 it allows for cues that are not independent
 
 
-def compatible(a: Int[np.ndarray, " m"], b: Int[np.ndarray, " d"]) -> Bool[np.ndarray, "m d"]:
+def compatible(
+    a: Int[np.ndarray, "*#classes"], b: Int[np.ndarray, "*#classes"]
+) -> Bool[np.ndarray, "*classes"]:
     """Whether classes are the same, or one of them is 0 for none."""
-    if not a.any() or not b.any():
-        return np.ones((len(a), len(b)), bool)
-    a, b = a[:, None], b[None]
     return (a == b) | (a == 0) | (b == 0)
 
 
@@ -58,13 +58,13 @@ def mahalanobis(
     places: Float[np.ndarray, "d k"],
     beside: Float[np.ndarray, "m d"],
     others: float = 0.0,
-) -> Float[np.ndarray, "m d"]:
+) -> Pairs:
     """-2 log p of each detection under each prediction, up to a constant, with lengths in boxes.
 
     Student's density with ν = 4 degrees of freedom: (ν + 4) log(1 + |d - μ|² / ν) + log |S|. What
     has been unseen for long has a large |S|, and less of a claim. `beside`: what pairs cost beside
     distance, added to it. `others`: the cost that stands for the density of detections of nobody.
-    Pairs that x alone puts above a cost of 0 cost infinitely.
+    Pairs that x or y alone put above a cost of 0 are none.
     """
     unit, place = predicted.unit, predicted.place
     total = predicted.var_place + (unit * errors) ** 2
@@ -72,13 +72,14 @@ def mahalanobis(
     volumes = np.minimum(np.sum(np.log(total / unit**2), axis=1) + others, _WIDEST)
     most = _FREEDOM * np.expm1((-volumes - np.min(beside, initial=0.0)) / power)
     # Most objects and detections are far apart: only near ones are worth all coordinates.
-    near = (places[:, 0] - place[:, :1]) ** 2 < (most * total[:, 0])[:, None]
-    rows, columns = np.nonzero(near)
+    reach = np.sqrt(np.maximum(most, 0.0) * total[:, :2].T)
+    rows, columns = intervals(place[:, 0] - reach[0], place[:, 0] + reach[0], places[:, 0])
+    near = np.abs(places[columns, 1] - place[rows, 1]) < reach[1, rows]
+    rows, columns = rows[near], columns[near]
     gaps = places[columns] - place[rows]
     tails = power * np.log1p(np.sum(gaps**2 / total[rows], axis=1) / _FREEDOM)
-    cost = np.full(near.shape, np.inf)
-    cost[rows, columns] = tails + volumes[rows] + beside[rows, columns]
-    return cost
+    values = tails + volumes[rows] + beside[rows, columns]
+    return Pairs(rows, columns, values, (len(place), len(places)))
 
 
 def marginals(log_odds: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
@@ -93,46 +94,26 @@ def marginals(log_odds: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
     return weighed / (missed + np.sum(weighed, axis=1))[:, None]
 
 
-def probabilities(
-    cost: Float[np.ndarray, "m d"], temperature: float = TEMPERATURE
-) -> Float[np.ndarray, "m d"]:
+def probabilities(cost: Pairs, temperature: float = TEMPERATURE) -> Float[np.ndarray, " p"]:
     """The marginals of pairs by their costs, -2 log p; a row without a pair costs nothing."""
-    rows, columns = np.nonzero(np.isfinite(cost))
-    probability = np.zeros(cost.shape)
-    probability[rows, columns] = expit(-cost[rows, columns] / (2 * temperature))
-    block = _rivals(cost.shape, rows, columns)
-    probability[block] = marginals(-cost[block] / (2 * temperature))
+    log_odds = -cost.values / (2 * temperature)
+    probability = expit(log_odds)
+    rivals = cost.rivals
+    block, rows, columns = cost._replace(values=log_odds).at(rivals).block(-np.inf)
+    probability[rivals] = marginals(block)[rows, columns]
     return probability
 
 
-def _rivals(
-    shape: tuple[int, ...], rows: Int[np.ndarray, " p"], columns: Int[np.ndarray, " p"]
-) -> tuple[np.ndarray, ...]:
-    """The block of the few pairs that have a rival: another one in their row or column."""
-    others = np.bincount(rows, minlength=shape[0])[rows] > 1
-    others |= np.bincount(columns, minlength=shape[1])[columns] > 1
-    return np.ix_(np.unique(rows[others]), np.unique(columns[others]))
-
-
-def argmax_pairs(value: Float[np.ndarray, "m d"]) -> Int[np.ndarray, " m"]:
-    """The column of each row where the two are each other's largest value above 0, else -1."""
-    m, d = value.shape
-    if not m or not d:
-        return np.full(m, -1)
-    first, rows = np.argmax(value, axis=1), np.arange(m)
-    mutual = (np.argmax(value, axis=0)[first] == rows) & (value[rows, first] > 0)
-    return np.where(mutual, first, -1)
-
-
-def one_to_one(cost: Float[np.ndarray, "m d"]) -> Int[np.ndarray, " m"]:
+def one_to_one(cost: Pairs) -> Int[np.ndarray, " m"]:
     """A column for each row at the least total cost; -1 for none, at cost 0."""
-    source = np.full(len(cost), -1)
     # A pair that costs more than none is as good as none, and one without rivals is chosen.
-    rows, columns = np.nonzero(cost < 0)
-    source[rows] = columns
-    block = _rivals(cost.shape, rows, columns)
-    source[block[0][:, 0]] = -1
-    rows, columns = linear_sum_assignment(np.minimum(cost[block], 0.0))
-    paired = cost[block][rows, columns] < 0
-    source[block[0][rows[paired], 0]] = block[1][0, columns[paired]]
+    cost = cost.at(cost.values < 0)
+    source, rivals = np.full(cost.shape[0], -1), cost.rivals
+    source[cost.rows[~rivals]] = cost.columns[~rivals]
+    pairs = cost.at(rivals)
+    block, rows, columns = pairs.block(0.0)
+    chosen = np.zeros(block.shape, bool)
+    chosen[linear_sum_assignment(block)] = True
+    chosen = chosen[rows, columns]
+    source[pairs.rows[chosen]] = pairs.columns[chosen]
     return source

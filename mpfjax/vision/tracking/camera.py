@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mpfjax.vision.tracking.associate import argmax_pairs, mahalanobis
+from mpfjax.vision.tracking.associate import mahalanobis
 from mpfjax.vision.tracking.gaussian import Gaussian
+from mpfjax.vision.tracking.pairs import Pairs
 
 _FREEDOM = 4.0  # degrees, of Student's distribution of what objects do on their own
 _ROUNDS = 5
@@ -33,7 +34,7 @@ class CameraState(NamedTuple):
         predicted: Gaussian,
         displacements: Float[np.ndarray, "#m 2"],
         is_known: bool,
-        cost: Float[np.ndarray, "m d"],
+        cost: Pairs,
         errors: Float[np.ndarray, "4"],
         places: Float[np.ndarray, "d 4"],
         box: Float[np.ndarray, "2"],
@@ -52,7 +53,7 @@ class CameraState(NamedTuple):
         `displacements` is by how much a jolt, or the motion from pixels, has moved each object:
         where the latter is `is_known`, c is what is left.
         """
-        partner = argmax_pairs(np.maximum(-cost, 0.0))
+        partner = cost._replace(values=-cost.values).partners
         rows = np.flatnonzero(partner >= 0)
         gaps = places[partner[rows], :2] - predicted.place[rows, :2]
         variances = (predicted.var_place + (predicted.unit * errors) ** 2)[rows, :2]
@@ -96,7 +97,7 @@ def find_jolt(
 
     def count_explained(shift: np.ndarray) -> int:
         cost = mahalanobis(objects.shift(shift), errors, places, unlike)
-        return int((cost < 0).any(axis=1).sum())
+        return len(np.unique(cost.rows[cost.values < 0]))
 
     leaders = slice(_LEADERS)
     gaps = places[None, :, :2] - objects.place[leaders, None, :2]

@@ -6,9 +6,10 @@ A box has the coordinates (x, y, log w, log h) in pixels, a point (x, y) in devi
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from mpfjax.checks import Renamed
+from mpfjax.vision.tracking.pairs import Pairs, intervals
 
 # The share of a size's growth rate that is left after a frame.
 _GROWTH_KEPT = 0.9
@@ -190,39 +191,24 @@ def units(places: Float[np.ndarray, "*m k"]) -> Float[np.ndarray, "*m k"]:
     return lengths
 
 
-def overlap(
-    a: Float[np.ndarray, "m k"], b: Float[np.ndarray, "d k"], variance: float = 2.0
-) -> Float[np.ndarray, "m d"]:
-    """`shared` of every box or point with every other."""
-    if a.shape[-1] == 2:
-        return shared(a[:, None], b[None], variance)
-    overlaps = np.zeros((len(a), len(b)))
-    rows, columns, values = overlapping(a, b)
-    overlaps[rows, columns] = values
-    return overlaps
-
-
 def overlapping(
     a: Float[np.ndarray, "m k"],
     b: Float[np.ndarray, "d k"],
     least: float = 0.0,
     variance: float = 2.0,
-) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """The pairs that share more than `least`: their rows, columns, and what they share."""
+) -> Pairs:
+    """The pairs of boxes, or of points, that share more than `least`, and what they share."""
     if a.shape[-1] == 2:
-        shares = overlap(a, b, variance)
-        rows, columns = np.nonzero(shares > least)
-        return rows, columns, shares[rows, columns]
+        shares = shared(a[:, None], b[None], variance)
+        return Pairs.of(shares, shares > least)
     # Most boxes are far apart along x: pairs from each left edge less the widest box on.
-    left, order = b[:, 0] - b[:, 2] / 2, np.argsort(b[:, 0] - b[:, 2] / 2)
-    low = a[:, 0] - a[:, 2] / 2 - np.max(b[:, 2], initial=0.0)
-    first, last = np.searchsorted(left[order], [low, a[:, 0] + a[:, 2] / 2])
-    counts = np.maximum(last - first, 0)
-    rows = np.repeat(np.arange(len(a)), counts)
-    columns = order[np.arange(len(rows)) + np.repeat(first - np.cumsum(counts) + counts, counts)]
-    values = shared(a[rows], b[columns])
-    above = values > least
-    return rows[above], columns[above], values[above]
+    left, low = b[:, 0] - b[:, 2] / 2, a[:, 0] - a[:, 2] / 2
+    widest = np.max(b[:, 2], initial=0.0)
+    rows, columns = intervals(low - widest, a[:, 0] + a[:, 2] / 2, left)
+    near = 2 * np.abs(a[rows, 1] - b[columns, 1]) < a[rows, 3] + b[columns, 3]
+    rows, columns = rows[near], columns[near]
+    pairs = Pairs(rows, columns, shared(a[rows], b[columns]), (len(a), len(b)))
+    return pairs.at(pairs.values > least)
 
 
 def shared(

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import expit
 
+from mpfjax.vision.tracking.pairs import Pairs
 from mpfjax.vision.tracking.scores import KEPT, PRIOR, rising
 
 _CONFIRMED = 2  # frames with strong detections after which there is an object
@@ -196,7 +197,7 @@ class Duplicates(NamedTuple):
         identities: Int[np.ndarray, " m"],
         stays: Bool[np.ndarray, " k"],
         detected: Bool[np.ndarray, " m"],
-        overlaps: Float[np.ndarray, "m m"],
+        overlaps: Pairs,
     ) -> "Duplicates":
         """Count what this frame decides, and give new objects their elders.
 
@@ -209,14 +210,19 @@ class Duplicates(NamedTuple):
         elder_lives = np.isin(self.elders, identities)
         ended = np.sum(~stays & elder_lives & (self.elders > 0))
         elders = np.where(elder_lives, self.elders, 0)[stays]
-        pairs = elders[:, None] == identities
         k = len(elders)
-        apart = (overlaps[:k] < _BESIDE) & detected[:k, None] & detected
-        is_object = (pairs & apart).any(axis=1)
-        older = identities < identities[k:, None]
-        beside = np.where(older, overlaps[k:], 0.0)
-        nearest = identities[np.argmax(beside, axis=1)] if len(beside) else identities[:0]
-        new_elders = np.where(np.max(beside, axis=1, initial=0.0) > _BESIDE, nearest, 0)
+        beside = overlaps.at(overlaps.values >= _BESIDE)
+        first, second = identities[beside.rows], identities[beside.columns]
+        with_elder = np.append(elders, 0 * identities[k:])[beside.rows] == second
+        is_apart = detected[:k].copy()
+        is_apart[beside.rows[with_elder]] = False
+        # Identities are in order.
+        elder_rows = np.minimum(np.searchsorted(identities, elders), max(len(identities) - 1, 0))
+        is_object = (elders > 0) & is_apart & detected[elder_rows]
+        younger = beside.at((beside.rows >= k) & (second < first) & (beside.values > _BESIDE))
+        order, new_elders = np.argsort(younger.values), 0 * identities[k:]
+        # Of several the last is written, with which it overlaps most.
+        new_elders[younger.rows[order] - k] = identities[younger.columns[order]]
         objects = KEPT * self.objects + np.sum(is_object)
         duplicates = KEPT * self.duplicates + ended
         return Duplicates(

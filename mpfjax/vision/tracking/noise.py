@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import softmax
 
 from mpfjax.vision.tracking.gaussian import Gaussian, units
@@ -34,6 +34,7 @@ _POINT_SPEED = np.full(2, 3.0)
 _NEWBORN, _LATEST = 4.0, 50.0
 _MEMORY = 20.0  # frames after which evidence is forgotten
 _FREEDOM = 4.0  # degrees, of Student's distribution of innovations
+_FOLLOWED = 128  # objects at a time tell the noises as well as more would
 
 
 # By the number of coordinates, for all objects.
@@ -58,7 +59,8 @@ class Noises(NamedTuple):
 class NoiseState(NamedTuple):
     """What is known of the noises: L candidates (errors, place, velocity) for each coordinate.
 
-    - `moments`: (m, L, k) each, every object under every candidate.
+    - `followed`: (m,), the objects that tell the noises, at most 128.
+    - `moments`: (n, L, k) each, every object that is followed under every candidate.
     - `evidence`: (L, k), discounted log-likelihoods of all objects together.
     - `squares`, `newborn`: sum of squared velocities of newborn objects, in boxes; their number.
     - `start`: the prior deviation of a newborn object's velocity.
@@ -66,6 +68,7 @@ class NoiseState(NamedTuple):
     - `noises`: what is believed.
     """
 
+    followed: Bool[np.ndarray, " m"]
     moments: Gaussian
     evidence: Float[np.ndarray, "l k"]
     squares: Float[np.ndarray, " k"]
@@ -82,10 +85,11 @@ class NoiseState(NamedTuple):
         start, scale = longer * speed, longer ** (_POWERS if coordinates == 4 else 0 * _POWERS)
         noises = Noises(*(scale[:, None] * prior), speed=start)
         none = np.zeros((_RIVALS[coordinates].shape[2], coordinates))
-        return cls(Gaussian.none(*none.shape), none, 0.0 * start, 0.0, start, scale, noises)
+        moments = Gaussian.none(*none.shape)
+        return cls(np.zeros(0, bool), moments, none, 0.0 * start, 0.0, start, scale, noises)
 
     def predict(self, frames: float) -> "NoiseState":
-        """Every object under every candidate, later; each candidate has its own units."""
+        """Every object that is followed, later, under every candidate in units of its own."""
         scale = self.scale[:, None, None, None]
         _, place, velocity = scale * _RIVALS[self.evidence.shape[1]]
         moments = self.moments.predict(place, velocity, self.moments.unit, frames)
@@ -93,12 +97,12 @@ class NoiseState(NamedTuple):
 
     def after(
         self,
-        rows: np.ndarray,
-        places: Float[np.ndarray, "n k"],
-        teaches: Bool[np.ndarray, " n"],
+        columns: Int[np.ndarray, " m"],
+        places: Float[np.ndarray, "d k"],
+        teaches: Bool[np.ndarray, " m"],
         grown: Gaussian,
     ) -> "NoiseState":
-        """Update the objects in these rows by their detections, and the evidence.
+        """Update the objects by the detections in these columns, -1 for none, and the evidence.
 
         Under each candidate a Kalman filter follows each object. The predictive density of the
         object's next detection, Student's since innovations have heavy tails, adds to the evidence
@@ -109,7 +113,9 @@ class NoiseState(NamedTuple):
 
         `self.moments` are predicted, have moved with the camera, and are written to.
         """
-        predicted = self.moments.at(rows)
+        columns, teaches = columns[self.followed], teaches[self.followed]
+        rows = columns >= 0
+        predicted, places, teaches = self.moments.at(rows), places[columns[rows]], teaches[rows]
         unit = predicted.unit
         posterior, gap, variance = predicted.update(
             places[:, None], unit * _RIVALS[self.evidence.shape[1]][0]
@@ -127,17 +133,24 @@ class NoiseState(NamedTuple):
         away = (logs - np.log(prior)[:, None]) / doubts[:, None, None]
         weights = softmax(evidence - 0.5 * np.sum(away**2, axis=0), axis=0)
         means = self.scale[:, None] * np.exp(np.sum(weights[None] * logs, axis=1))
-        rest = evidence, squares, newborn, self.start, self.scale
-        return NoiseState(self.moments, *rest, Noises(*means, speed=speed))
+        noises = Noises(*means, speed=speed)
+        return self._replace(evidence=evidence, squares=squares, newborn=newborn, noises=noises)
 
-    def newborns(
-        self, places: Float[np.ndarray, "n k"], speed: Float[np.ndarray, " k"]
-    ) -> Gaussian:
-        """New objects under every candidate."""
-        unit = units(places)[:, None]
-        return Gaussian.initial(
-            places[:, None], unit * _RIVALS[self.evidence.shape[1]][0], unit * speed
+    def renew(
+        self,
+        stays: Bool[np.ndarray, " m"],
+        places: Float[np.ndarray, "n k"],
+        speed: Float[np.ndarray, " k"],
+    ) -> "NoiseState":
+        """Without the objects that end, and with new ones at these places while there is room."""
+        moments, followed = self.moments.at(stays[self.followed]), self.followed[stays]
+        is_followed = np.arange(len(places)) < _FOLLOWED - len(moments.place)
+        unit = units(places[is_followed])[:, None]
+        newborns = Gaussian.initial(
+            places[is_followed, None], unit * _RIVALS[self.evidence.shape[1]][0], unit * speed
         )
+        followed = np.append(followed, is_followed)
+        return self._replace(followed=followed, moments=moments.append(newborns))
 
     def _speeds(self, grown: Gaussian) -> tuple[Float[np.ndarray, " k"], float]:
         """The sum of squared velocities of newborn objects and their number, with this frame's.

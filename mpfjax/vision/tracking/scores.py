@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import isotonic_regression
 from scipy.special import expit, logit
 
-from mpfjax.vision.tracking.associate import argmax_pairs
 from mpfjax.vision.tracking.gaussian import overlapping
+from mpfjax.vision.tracking.pairs import Pairs
 
 # Minutes: in a street that is empty for a while, what is left must not set what is sure.
 _REMEMBERED = 8192
@@ -61,7 +61,7 @@ class ScoreState(NamedTuple):
         self,
         boxes: Float[np.ndarray, "d k"],
         scores: Float[np.ndarray, " d"],
-        overlaps: Float[np.ndarray, "d d"],
+        overlaps: Pairs,
         moved: Float[np.ndarray, "c k"],
         frames: float,
         lasting: float,
@@ -90,7 +90,9 @@ class ScoreState(NamedTuple):
         lowest = recent.min(initial=0.0)
         spread = sure - lowest
         shares = (scores - lowest) / spread if spread > 0 else np.ones_like(scores)
-        single = ~np.triu(overlaps > _DUPLICATE, 1).any(axis=0)
+        single = np.ones(len(boxes), bool)
+        is_same = (overlaps.rows < overlaps.columns) & (overlaps.values > _DUPLICATE)
+        single[overlaps.columns[is_same]] = False
         state = self._continue(boxes[single], moved, shares[single], frames, lasting, variance)
         strong = lowest + state.strong_share() * spread
         # Where all scores are equal, rounding must not put them below the threshold.
@@ -109,13 +111,13 @@ class ScoreState(NamedTuple):
         """The chains after a frame whose detections have these shares of a sure score."""
         since = frames * (1 + self.unseen[:, None])
         ahead = moved + np.pad(since * self.steps, ((0, 0), (0, moved.shape[1] - 2)))
-        nearness = np.zeros((len(moved), len(detections)))
         # At a low rate what is fast leaves its last box; elsewhere steps are mostly errors.
-        for boxes, certainty in ((ahead, 0), (self.boxes, 1), (moved, 1)):
-            *pairs, common = overlapping(boxes, detections, _SAME, variance)
-            pairs = tuple(pairs)
-            nearness[pairs] = np.maximum(nearness[pairs], certainty + common)
-        rows = argmax_pairs(nearness)
+        kinds = [
+            overlapping(boxes, detections, _SAME, variance) for boxes in (ahead, self.boxes, moved)
+        ]
+        kinds[1:] = [each._replace(values=1 + each.values) for each in kinds[1:]]
+        rows, columns, nearness = (np.concatenate([each[i] for each in kinds]) for i in range(3))
+        rows = Pairs(rows, columns, nearness, kinds[0].shape).partners
         is_detected = rows >= 0
         old, new = np.flatnonzero(is_detected), np.setdiff1d(np.arange(len(detections)), rows)
         steps = np.concatenate([self.steps, np.zeros((len(new), 2))])

@@ -20,13 +20,14 @@ from mpfjax.vision.tracking.gaussian import (
     Gaussian,
     along,
     boxes_of,
-    overlap,
+    overlapping,
     shared,
     units,
     within,
 )
 from mpfjax.vision.tracking.kinds import Kind
 from mpfjax.vision.tracking.lives import Lives, Spans
+from mpfjax.vision.tracking.pairs import Pairs
 from mpfjax.vision.tracking.scores import STRONG, WEAK
 from mpfjax.vision.tracking.state import TrackerState, Tracks
 from mpfjax.vision.tracking.vectors import cosine_distances
@@ -51,7 +52,7 @@ class _Frame(NamedTuple):
     - `places`: (d, k), of the detections; `scores`: (d,), all equal if these are not to count.
     - `costs`: (m, d), what pairs cost beside distance; `distances`: (m, d), cosine distances of
       their vectors, (0, 0) without any.
-    - `overlaps`: (d, d), of detections that may be of one object.
+    - `overlaps`: of detections that may be of one object.
     - `strong`: (d,), which are, and `counts`: which may be of an object.
     """
 
@@ -62,7 +63,7 @@ class _Frame(NamedTuple):
     scores: Float[np.ndarray, " d"]
     costs: Float[np.ndarray, "m d"]
     distances: Float[np.ndarray, "a b"]
-    overlaps: Float[np.ndarray, "d d"]
+    overlaps: Pairs
     strong: Bool[np.ndarray, " d"] = np.zeros(0, bool)
     counts: Bool[np.ndarray, " d"] = np.zeros(0, bool)
 
@@ -182,7 +183,9 @@ def _compare(
         detections = detections._replace(classes=np.zeros_like(detections.classes))
     classes, colours, vectors = detections.classes, detections.colours, detections.vectors
     other_class = _CLASS_COST if tracker.class_matters == "prefers" else np.inf
-    costs = np.where(compatible(state.lives.classes, classes), 0.0, other_class)
+    costs = np.broadcast_to(0.0, (len(state.lives.classes), len(classes)))
+    if state.lives.classes.any() and classes.any():
+        costs = np.where(compatible(state.lives.classes[:, None], classes), costs, other_class)
     if colours is not None:
         costs = costs + unlikeness(colours, state.colours)
     distances = np.zeros((0, 0))
@@ -190,8 +193,8 @@ def _compare(
         state = _with_vectors(state, vectors.shape[1])
         distances = cosine_distances(state.vectors, vectors)
         costs = costs + state.likeness.cost(distances)
-    overlaps = overlap(detections.boxes, detections.boxes)
-    overlaps[~_may_be_one(tracker, classes, classes)] = 0.0
+    boxes = detections.boxes
+    overlaps = _of_one_class(tracker, overlapping(boxes, boxes), classes, classes)
     spans, scores = Spans.at(tracker.rate, tracker.lost_seconds), detections.scores
     if tracker.scores == "ignore":
         scores = np.ones_like(scores)
@@ -222,16 +225,16 @@ def _with_camera(
     num_strong = np.where(lives.confirmed & (lives.unseen == 0), lives.num_strong, 0)
     counts, strong = (scores >= least for least in (state.scores.weak, state.scores.strong))
     cost = mahalanobis(state.objects, errors, places, costs)
-    near = np.asarray(np.any((cost < 0) & counts, axis=1))
+    near = np.zeros(len(num_strong), bool)
+    near[cost.rows[(cost.values < 0) & counts[cost.columns]]] = True
     jolt = find_jolt(state.objects, errors, places, costs, num_strong, near, counts)
     objects, confirmed = state.objects.shift(jolt), lives.confirmed
     if jolt.any():
         cost = mahalanobis(objects, errors, places, costs)
     box = np.exp(objects.place[confirmed, 2:].sum(axis=0) / max(confirmed.sum(), 1))
-    strong_pairs = cost[np.ix_(confirmed, strong)], errors, places[strong]
-    camera, shift = state.camera.after(
-        objects.at(confirmed), displacements[confirmed] + jolt, is_known, *strong_pairs, box
-    )
+    cost = cost.at(confirmed[cost.rows] & strong[cost.columns])
+    about = objects, displacements + jolt, is_known, cost, errors, places, box
+    camera, shift = state.camera.after(*about)
     shift = jolt + shift
     noise = state.noise._replace(moments=state.noise.moments.shift(shift))
     objects = state.objects.shift(shift)
@@ -260,19 +263,19 @@ def _match(kind: Kind, state: TrackerState, frame: _Frame) -> _Matches:
     others = 0.0 if kind.has_boxes else state.clutter.cost
     errors = state.noise.noises.errors
     distance = mahalanobis(state.objects, errors, frame.places, frame.costs, others)
-    pairs = np.nonzero(np.isfinite(distance) & frame.counts)
-    costs = distance[pairs] + np.where(frame.strong, 0.0, _WEAK_COST)[pairs[1]]
-    costs += np.where(state.lives.confirmed, 0.0, _DOUBT_COST)[pairs[0]]
-    claims = np.where(state.duplicates.doubtful, _YIELDING, 1.0)[pairs[0]]
-    cost = np.full(distance.shape, np.inf)
-    cost[pairs] = np.where(costs < 0, claims * costs, np.inf)
+    distance = distance.at(frame.counts[distance.columns])
+    costs = distance.values + np.where(frame.strong, 0.0, _WEAK_COST)[distance.columns]
+    costs += np.where(state.lives.confirmed, 0.0, _DOUBT_COST)[distance.rows]
+    distance, costs = distance.at(costs < 0), costs[costs < 0]
+    claims = np.where(state.duplicates.doubtful, _YIELDING, 1.0)[distance.rows]
+    cost = distance._replace(values=claims * costs)
     columns = one_to_one(cost)
-    matched = columns >= 0
-    rows, probability = np.flatnonzero(matched), np.zeros(len(columns))
-    probability[rows] = probabilities(cost, kind.temperature)[rows, columns[rows]]
+    matched, chosen = columns >= 0, columns[cost.rows] == cost.columns
+    rows, probability = cost.rows[chosen], np.zeros(len(columns))
+    probability[rows] = probabilities(cost, kind.temperature)[chosen]
     gains = np.where(matched, 0.0, kind.missed)
     if not kind.has_boxes:
-        gains[rows] = -0.5 * distance[rows, columns[rows]]
+        gains[rows] = -0.5 * distance.values[chosen]
     strong = np.append(frame.strong, False)[columns]
     return _Matches(columns, matched, strong, probability, gains)
 
@@ -316,11 +319,14 @@ def _births(
 ) -> Bool[np.ndarray, " d"]:
     """Which strong detections begin an object: no object has them, or is there already."""
     boxes, classes, extent = (getattr(frame.detections, n) for n in ("boxes", "classes", "extent"))
-    covered = overlap(boxes_of(state.objects.place[stays]), boxes) > _BIRTH_OVERLAP
-    covered &= _may_be_one(tracker, state.lives.classes[stays], classes)
-    is_birth = frame.strong & within(boxes, extent) & ~covered.any(axis=0)
-    is_birth[matches.columns[matches.matched]] = False
-    return is_birth & ~(np.triu(frame.overlaps > _BIRTH_OVERLAP, 1) & is_birth[:, None]).any(axis=0)
+    covered = overlapping(boxes_of(state.objects.place[stays]), boxes, _BIRTH_OVERLAP)
+    covered = _of_one_class(tracker, covered, state.lives.classes[stays], classes)
+    is_birth = frame.strong & within(boxes, extent)
+    is_birth[covered.columns] = is_birth[matches.columns[matches.matched]] = False
+    others = frame.overlaps.at(frame.overlaps.values > _BIRTH_OVERLAP)
+    is_first = others.rows < others.columns
+    is_birth[others.columns[is_first & is_birth[others.rows]]] = False
+    return is_birth
 
 
 def _renew(
@@ -333,13 +339,12 @@ def _renew(
 ) -> TrackerState:
     """Without the objects that end, and with those that begin; the former teach the noises."""
     objects, lives, noises = state.objects, state.lives, state.noise.noises
-    matched, places = matches.matched, frame.places[born]
+    places = frame.places[born]
     teaches = matches.strong & stays
     experienced = teaches & lives.confirmed & (lives.num_strong >= _FIRST)
     grown = objects.at(teaches & (lives.num_strong == _FIRST))
-    its = frame.places[matches.columns[matched]]
-    noise = state.noise.after(matched, its, experienced[matched], grown)
-    moments = noise.moments.at(stays).append(noise.newborns(places, noises.speed))
+    noise = state.noise.after(matches.columns, frame.places, experienced, grown)
+    noise = noise.renew(stays, places, noises.speed)
     unit = units(places)
     start = Gaussian.initial(places, unit * noises.errors, unit * noises.speed)
     names = state.last_identity + 1 + np.arange(len(born))
@@ -353,7 +358,7 @@ def _renew(
     )
     return state._replace(
         objects=objects.at(stays).append(start), lives=lives.at(stays).append(new_lives),
-        noise=noise._replace(moments=moments), colours=colours, vectors=vectors,
+        noise=noise, colours=colours, vectors=vectors,
         last_identity=state.last_identity + len(born),
     )  # fmt: skip
 
@@ -371,11 +376,11 @@ def _describe(
     values = renewed.values(detections.classes, 0), renewed.values(detections.scores, 0.0)
     lives = state.lives.describe(matched, *values)
     boxes = boxes_of(state.objects.place)
-    overlaps = overlap(boxes, boxes)
-    overlaps[~_may_be_one(tracker, lives.classes, lives.classes)] = 0.0
+    overlaps = _of_one_class(tracker, overlapping(boxes, boxes), lives.classes, lives.classes)
     duplicates = state.duplicates.after(lives.identities, stays, matched, overlaps)
     lives = lives._replace(shown=lives.shown & ~duplicates.doubtful)
-    alone = np.sum(overlaps > _CONTACT, axis=1) <= 1  # each overlaps itself
+    contacts = overlaps.rows[overlaps.values > _CONTACT]  # each overlaps itself
+    alone = np.bincount(contacts, minlength=len(boxes)) <= 1
     colours, vectors, likeness = state.colours, state.vectors, state.likeness
     if detections.colours is not None:
         values = renewed.values(detections.colours, 0.0)
@@ -401,8 +406,10 @@ def _tracks(
     )
 
 
-def _may_be_one(
-    tracker: "ObjectTracker", a: Int[np.ndarray, " m"], b: Int[np.ndarray, " d"]
-) -> Bool[np.ndarray, "m d"]:
-    """Whether boxes of these classes may be of one object."""
-    return compatible(a, b) | (tracker.class_matters == "prefers")
+def _of_one_class(
+    tracker: "ObjectTracker", pairs: Pairs, a: Int[np.ndarray, " m"], b: Int[np.ndarray, " d"]
+) -> Pairs:
+    """The pairs that may be of one object by their classes."""
+    if tracker.class_matters == "prefers":
+        return pairs
+    return pairs.at(compatible(a[pairs.rows], b[pairs.columns]))
