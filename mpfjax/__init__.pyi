@@ -41,8 +41,8 @@ from mpfjax.models.linear import LinearGaussianModel as LinearGaussianModel
 from mpfjax.models.linear import SwitchingLinearGaussianModel as SwitchingLinearGaussianModel
 from mpfjax.models.multi_object import MultiObjectModel as MultiObjectModel
 from mpfjax.models.multi_object import PairwiseRepulsion as PairwiseRepulsion
-from mpfjax.models.observations import Series as Series
 from mpfjax.models.quadratic import QuadraticModel as QuadraticModel
+from mpfjax.models.series import Series as Series
 from mpfjax.models.simulation import simulate as simulate
 from mpfjax.models.targets import TargetsModel as TargetsModel
 from mpfjax.moves.base import AbstractMarkovMove as AbstractMarkovMove

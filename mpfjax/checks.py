@@ -44,7 +44,6 @@ _INNER = ("mpfjax.", "equinox.", "jaxtyping.", "contextlib")  # modules that use
 _JAX = ("jax", "jaxlib", "numpy")
 _LONGEST = 200
 _MOST = 2**31 - 1
-_EXACT, _FAR = 2**24, 2**17  # float32 holds whole numbers up to the first, and 1/64 at the second
 
 
 def is_series(value: Any) -> TypeGuard[Iterable[Any]]:
@@ -59,19 +58,15 @@ def as_numbers(
     *,
     floating: bool = False,
     may_be_complex: bool = False,
-    in_time: bool = False,
 ) -> Any:
     """The argument as an array of JAX or numpy that holds the same numbers for JAX.
 
     JAX alone would misread bytes of another order, keep the lower half of whole numbers beyond 32
     bits, and drop masks. Raises `ValueError` for masked numbers, anything but numbers, complex ones
     unless allowed, and numbers that JAX's own type cannot hold; floating point numbers may be
-    rounded, but of numbers `in_time`, the leading axis, float32 must not lose the differences. With
-    `floating`, whole numbers and booleans become floating point numbers.
+    rounded. With `floating`, whole numbers and booleans become floating point numbers.
     """
     array = array_of_numbers(name, value, may_be_complex)
-    if in_time:
-        _check_differences(name, array)
     if floating and not jnp.issubdtype(array.dtype, jnp.inexact):
         array = array.astype(float)
     if isinstance(array, jax.Array):
@@ -85,48 +80,6 @@ def as_numbers(
         first = array[lost][0]
         raise ValueError(f"{name}: {first:g} is more than {dtype} holds; set jax_enable_x64")
     return result
-
-
-def _check_differences(name: str, array: Any) -> None:
-    """Raise a `ValueError` for numbers that differ from one step to the next by what float32 loses.
-
-    They are large, or a long series that goes somewhere: whatever else differs by so little is a
-    rounding error itself, as in times between observations. Of what is in float32 already, the gaps
-    between such numbers stand for what was lost.
-    """
-    default = jax.dtypes.canonicalize_dtype(np.float64)
-    is_wide = array.dtype.itemsize > 2 and array.dtype.kind in "iuf"
-    if isinstance(array, Tracer) or not is_wide or default == np.float64:
-        return
-    is_rounded = array.dtype == np.float32
-    if (
-        np.ndim(array) == 0
-        or len(array) < 2
-        or (is_rounded and np.nanmax(np.abs(array), initial=0) < _EXACT)
-    ):
-        return
-    rows = np.asarray(array, float).reshape(len(array), -1)
-    with np.errstate(over="ignore"):
-        rows = np.where(np.isfinite(rows.astype(np.float32)), rows, np.nan)
-    steps = np.diff(rows, axis=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are empty, or overflow
-        sizes, apart = np.nanmax(np.abs(rows), axis=0), np.nanmean(np.abs(steps), axis=0)
-        lost = np.nanmean(np.abs(rows.astype(np.float32) - rows), axis=0)
-        if is_rounded:
-            lost = np.where(sizes >= _EXACT, 0.25 * np.spacing(sizes.astype(np.float32)), 0.0)
-    # A walk goes farther than its steps, which rounding errors about a constant do not.
-    with np.errstate(invalid="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        extent = np.nanmax(rows, axis=0) - np.nanmin(rows, axis=0)
-    walks = (len(rows) >= 8) & (extent >= 6.99 * apart)
-    is_lost = (apart > 0) & (lost > 0.01 * apart) & ((sizes > _FAR) | walks)
-    if is_lost.any():
-        at = int(np.argmax(is_lost))
-        near = f"numbers near {sizes[at]:.10g} that differ by {apart[at]:.2g}"
-        way_out = "np.diff(x) of times, x - x[0] of places"
-        where = f"float32 cannot tell {near}; subtract in numpy before, as {way_out}"
-        raise ValueError(f"{name}: {where}, or set jax_enable_x64")
 
 
 def _array(value: Any) -> Any:

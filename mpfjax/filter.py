@@ -2,20 +2,15 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count, checked, format_fields, kinds, shown
 from mpfjax.memory import after_step
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import AbstractStateSpaceModel, with_inputs
+from mpfjax.models.base import AbstractStateSpaceModel, periods_of, with_inputs
 from mpfjax.models.law import law_of
 from mpfjax.models.noise import Noise
 from mpfjax.models.observations import one_input, one_observation
@@ -26,19 +21,14 @@ from mpfjax.moves.base import (
     Step,
     all_of,
     as_moves,
+    check_keep_parents,
     memory_of,
     name_of,
 )
 from mpfjax.operations.compiling import jit_with_floats_traced
-from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import drawn_once
-from mpfjax.report import StepInfo, report_of
-
-BROKEN_DENSITY = (
-    "model: a density was NaN or infinite for some particle, or GroupBy: group gave a label outside"
-    " [0, M)"
-)
+from mpfjax.report import StepInfo, report_of, with_densities
 
 
 class Filter(eqx.Module):
@@ -247,36 +237,6 @@ def _one_step(filter, key, mixture, observation, inputs):
 @jit_with_floats_traced
 def _start(filter, keys, observation, inputs, particles):
     return filter._init(keys, observation, inputs, particles=particles)
-
-
-def periods_of(model: Any) -> PyTree:
-    """The periods of the state in floating point; None for a model without any."""
-    as_floats = partial(jnp.asarray, dtype=default_float())
-    return jax.tree.map(as_floats, getattr(model, "periods", None))
-
-
-def with_densities(value: PyTree, increments: Float[Array, "*runs_and_t"]) -> PyTree:
-    """`value`, or a RuntimeError where an increment of log Ẑ is NaN or +inf.
-
-    A program cannot raise, so increments are looked at after it has ended. Under the caller's own
-    jit nothing is raised: look at `StepInfo.broken` or `FilterRun.broken` outside.
-    """
-    if isinstance(increments, Tracer):
-        return value
-    broken = ~(np.asarray(increments) < np.inf)
-    if broken.any():
-        step = int(np.argmax(broken.any(axis=tuple(range(broken.ndim - 1))))) if broken.ndim else 0
-        at = f", first at index {step} of the steps" if broken.ndim else ""
-        raise RuntimeError(f"{BROKEN_DENSITY}{at}")
-    return value
-
-
-def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: str) -> None:
-    """Raise a `ValueError` that names a move after which particles have no single parents."""
-    for move in all_of(moves):
-        if not move.keeps_parents:
-            which = f"one parent x_(t-1), which {needed_by} needs (restarts leave none)"
-            raise ValueError(f"{argument}: {name_of(move)} leaves no particle {which}")
 
 
 def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> ParticleMixture:

@@ -3,10 +3,17 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, PyTree
 
 from mpfjax.checks import Renamed
 from mpfjax.mixture import ParticleMixture
+
+BROKEN_DENSITY = (
+    "model: a density was NaN or infinite for some particle, or GroupBy: group gave a label outside"
+    " [0, M)"
+)
 
 
 class StepInfo(eqx.Module):
@@ -51,10 +58,7 @@ class StepInfo(eqx.Module):
         return ~(self.log_likelihood_increment < jnp.inf)
 
 
-def report_of(
-    mixture: ParticleMixture,
-    **additions: Array,
-) -> StepInfo:
+def report_of(mixture: ParticleMixture, **additions: Array) -> StepInfo:
     """The report of a step that ended in this mixture, with what its memories add."""
     assert mixture.within is not None
     # It is a diagnosis: the gradient of a run need not go through it at every step.
@@ -71,3 +75,19 @@ def report_of(
         "labels_ran_out": jnp.all(sizes > 0) & (mixture.num_components > 1),
     }
     return StepInfo(**fields | additions)
+
+
+def with_densities(value: PyTree, increments: Float[Array, "*runs_and_t"]) -> PyTree:
+    """`value`, or a RuntimeError where an increment of log Ẑ is NaN or +inf.
+
+    A program cannot raise, so increments are looked at after it has ended. Under the caller's own
+    jit nothing is raised: look at `StepInfo.broken` or `FilterRun.broken` outside.
+    """
+    if isinstance(increments, Tracer):
+        return value
+    broken = ~(np.asarray(increments) < np.inf)
+    if broken.any():
+        step = int(np.argmax(broken.any(axis=tuple(range(broken.ndim - 1))))) if broken.ndim else 0
+        at = f", first at index {step} of the steps" if broken.ndim else ""
+        raise RuntimeError(f"{BROKEN_DENSITY}{at}")
+    return value

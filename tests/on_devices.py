@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from mpfjax.models.observations import Series
+from mpfjax.models.series import Series
 from mpfjax.running.devices import over_devices
 from mpfjax.running.islands import IslandInteraction, _run_block, _run_on_one
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 import mpfjax
 from benchmarks import harness
 from mpfjax.exact import grid_filter
-from mpfjax.models.observations import Series
+from mpfjax.models.series import Series
 from mpfjax.tuning import Interval, Positive, fit
 from mpfjax.tuning.evidence import FisherEvidence, LogEvidence
 from mpfjax.tuning.problem import Reals

@@ -15,7 +15,7 @@ from mpfjax.arrays import (
 from mpfjax.checks import shown
 from mpfjax.models.base import real_each, require, with_inputs
 from mpfjax.models.law import law_of, refuse_marginalised
-from mpfjax.models.observations import Series, as_series
+from mpfjax.models.series import Series, as_series
 from mpfjax.operations.logarithms import log_or_nothing, log_sum_exp, softmax
 
 

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float, PyTree
 from mpfjax.checks import as_numbers, checked
 from mpfjax.models.base import with_inputs
 from mpfjax.models.linear import LinearGaussianModel
-from mpfjax.models.observations import (
-    NOT_FINITE,
+from mpfjax.models.observations import NOT_FINITE, numpy_for
+from mpfjax.models.series import (
     Series,
-    numpy_for,
+    check_differences,
     present_steps,
     series_of,
     steps_of_inputs,
@@ -104,7 +104,8 @@ def _checked(model: Any, data: PyTree) -> tuple[Any, PyTree]:
 
 def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Any:
     """y_1..y_t as an array of this type, NaN where missing; a `ValueError` for what is none."""
-    rows = as_numbers("observations", series.observations, floating=True, in_time=True)
+    check_differences("observations", series.observations)
+    rows = as_numbers("observations", series.observations, floating=True)
     if rows.ndim != 2 or rows.shape[1] != num_rows:
         raise ValueError(f"observations: shape {rows.shape} is not (t, {num_rows})")
     present = present_steps(rows, series, "infinite" if series.skips_missing else NOT_FINITE)

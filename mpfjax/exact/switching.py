@@ -16,7 +16,7 @@ from mpfjax.exact.kalman import (
     smoothed,
 )
 from mpfjax.models.linear import SwitchingLinearGaussianModel
-from mpfjax.models.observations import series_of, steps_of_inputs
+from mpfjax.models.series import series_of, steps_of_inputs
 from mpfjax.operations.logarithms import log_sum_exp
 
 

@@ -19,7 +19,7 @@ from mpfjax.models.base import is_made_of_noise, over_particles, require_noise
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
 from mpfjax.models.law import law_of
 from mpfjax.models.noise import noise_dtype
-from mpfjax.models.observations import as_series
+from mpfjax.models.series import as_series
 from mpfjax.moves.base import AbstractRegrouping, name_of
 from mpfjax.moves.every import Every
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample

@@ -15,7 +15,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import with_inputs
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.law import law_of
-from mpfjax.models.observations import Series
+from mpfjax.models.series import Series
 from mpfjax.running.results import FilterRun
 
 # The effective number of particles for each coefficient of a regression.

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import RULES, Count, Rule, check, check_one_each, kinds, saying, shown
 from mpfjax.models.noise import noise_dtype
+from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import normal, split
 
 
@@ -328,3 +329,9 @@ def per_particle(model: Any) -> AbstractStateSpaceModel:
     for method in ("sample_initial", law, "log_likelihood"):
         require(model, method, "per_particle")
     return _PerParticleModel(model)
+
+
+def periods_of(model: Any) -> PyTree:
+    """The periods of the state in floating point; None for a model without any."""
+    periods = getattr(model, "periods", None)
+    return jax.tree.map(lambda period: jnp.asarray(period, default_float()), periods)

@@ -15,7 +15,7 @@ from mpfjax.models.base import (
     require,
     with_inputs,
 )
-from mpfjax.models.observations import steps_of_inputs
+from mpfjax.models.series import steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 

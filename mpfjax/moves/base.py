@@ -389,3 +389,11 @@ def propagation_of(moves: Moves) -> AbstractPropagationOfEach | None:
         if inner is not None:
             return inner
     return None
+
+
+def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: str) -> None:
+    """Raise a `ValueError` that names a move after which particles have no single parents."""
+    for move in all_of(moves):
+        if not move.keeps_parents:
+            which = f"one parent x_(t-1), which {needed_by} needs (restarts leave none)"
+            raise ValueError(f"{argument}: {name_of(move)} leaves no particle {which}")

@@ -44,20 +44,6 @@ def over_islands(value: Array) -> Array:
     return everywhere.reshape(-1, *value.shape)
 
 
-def deal_to_islands(values: Array) -> Array:
-    """Row i of every island to island i mod G; the leading axis must be a multiple of G.
-
-    A second call brings the rows of an island back to it, in another order.
-    """
-    num_devices, on_device = jax.lax.psum(1, DEVICE_AXIS), jax.lax.psum(1, ISLAND_AXIS)
-    # Under vmap, JAX 0.10 gives a wrong shape to a value that is the same on all devices.
-    values = jnp.where(island_index() >= 0, values, values)
-    dealt = values.reshape(-1, num_devices, on_device, *values.shape[1:])
-    dealt = jax.lax.all_to_all(dealt, ISLAND_AXIS, split_axis=2, concat_axis=2)
-    dealt = jax.lax.all_to_all(dealt, DEVICE_AXIS, split_axis=1, concat_axis=1)
-    return dealt.reshape(values.shape)
-
-
 def excess_over_islands(
     log_scale: Float[Array, ""], log_largest: Float[Array, ""], log_sum: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:

@@ -16,20 +16,20 @@ from jaxtyping import Array, Bool, Key, PyTree
 from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.observations import as_series, series_of
+from mpfjax.models.series import as_series, series_of
 from mpfjax.moves.base import AbstractMove, Step, is_missing
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.islands import (
     DEVICE_AXIS,
     ISLAND_AXIS,
-    deal_to_islands,
     num_islands,
     over_islands,
 )
 from mpfjax.operations.logarithms import softmax
 from mpfjax.running.devices import choose_devices, over_devices
+from mpfjax.running.diagnosis import sound
 from mpfjax.running.results import FilterRun
-from mpfjax.running.scan import scan, sound
+from mpfjax.running.scan import scan
 
 
 @checked
@@ -194,6 +194,18 @@ class IslandInteraction(AbstractMove):
             return mixture
         if n % islands:
             raise ValueError(f"num_particles: {n} of an island, for {islands} islands alike")
-        return jax.lax.cond(
-            self.is_due(mixture), lambda: mixture.map_slots(deal_to_islands), lambda: mixture
-        )
+        return jax.lax.cond(self.is_due(mixture), lambda: mixture.map_slots(_deal), lambda: mixture)
+
+
+def _deal(values: Array) -> Array:
+    """Row i of every island to island i mod G; the leading axis must be a multiple of G.
+
+    A second call brings the rows of an island back to it, in another order.
+    """
+    num_devices, on_device = jax.lax.psum(1, DEVICE_AXIS), jax.lax.psum(1, ISLAND_AXIS)
+    # Under vmap, JAX 0.10 gives a wrong shape to a value that is the same on all devices.
+    values = jnp.where(island_index() >= 0, values, values)
+    dealt = values.reshape(-1, num_devices, on_device, *values.shape[1:])
+    dealt = jax.lax.all_to_all(dealt, ISLAND_AXIS, split_axis=2, concat_axis=2)
+    dealt = jax.lax.all_to_all(dealt, DEVICE_AXIS, split_axis=1, concat_axis=1)
+    return dealt.reshape(values.shape)

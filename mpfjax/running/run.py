@@ -11,11 +11,13 @@ from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.memory import at_start
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.observations import as_series, series_of
+from mpfjax.models.series import as_series, series_of
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import num_processors, over_devices, over_threads
+from mpfjax.running.diagnosis import sound, warn_of_start
+from mpfjax.running.keys import initial_keys
 from mpfjax.running.results import FilterRun
-from mpfjax.running.scan import first_mixture, initial_keys, scan, sound, warn_of_start
+from mpfjax.running.scan import first_mixture, scan
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
 # have a row of particles each, which counts as so many times the particles.

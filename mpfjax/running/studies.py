@@ -19,7 +19,7 @@ from tqdm import tqdm
 from mpfjax.checks import Checked, Count, by_name, check, checked, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.observations import as_series, check_series
+from mpfjax.models.series import as_series, check_series
 from mpfjax.operations.logarithms import default_float
 from mpfjax.running.results import FilterRun
 from mpfjax.running.run import monte_carlo

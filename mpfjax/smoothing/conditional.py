@@ -12,12 +12,15 @@ from mpfjax.checks import checked, kinds
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.models.law import law_of, refuse_marginalised
-from mpfjax.models.observations import Series, as_arrays, as_series, refuse_where
+from mpfjax.models.observations import refuse_where
+from mpfjax.models.series import Series, as_series, rows_of
 from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.random import split, uniform
+from mpfjax.running.diagnosis import sound
+from mpfjax.running.keys import initial_keys
 from mpfjax.running.results import FilterRun
-from mpfjax.running.scan import initial_keys, scan, sound
+from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import draw, log_transitions
 from mpfjax.smoothing.history import ancestors_of, mixtures_of, paths_through
 from mpfjax.smoothing.trajectories import draw_trajectories
@@ -193,7 +196,7 @@ def shape_of_trajectory(model: Any, length: int) -> PyTree:
 
 def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> PyTree:
     """The trajectory as arrays of the states' types; a `ValueError` for one of other shapes."""
-    like, arrays = shape_of_trajectory(model, length), as_arrays(trajectory, "trajectory")
+    like, arrays = shape_of_trajectory(model, length), rows_of(trajectory, "trajectory")
 
     def convert(leaf: Any, state: jax.ShapeDtypeStruct) -> Any:
         may_be = np.can_cast(jnp.result_type(leaf), state.dtype, "same_kind")

@@ -9,7 +9,7 @@ from mpfjax.checks import Count, check_one_each, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import with_inputs
-from mpfjax.models.observations import steps_of_inputs
+from mpfjax.models.series import steps_of_inputs
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.running.results import FilterRun
 

@@ -12,18 +12,21 @@ from jax.core import Tracer
 from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.checks import Checked, CountOrZero, check_one_each, checked, saying
-from mpfjax.filter import Filter, check_keep_parents
+from mpfjax.filter import Filter
 from mpfjax.memory import check_past
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import over_particles, require, with_inputs
 from mpfjax.models.law import refuse_marginalised
-from mpfjax.models.observations import as_series, one_input, one_observation
+from mpfjax.models.observations import one_input, one_observation
+from mpfjax.models.series import as_series
+from mpfjax.moves.base import check_keep_parents
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.logarithms import as_inexact
 from mpfjax.operations.random import split
 from mpfjax.report import StepInfo
+from mpfjax.running.diagnosis import sound
 from mpfjax.running.results import FilterRun
-from mpfjax.running.scan import first_mixture, report_of, run_of, sound, step_or_predict
+from mpfjax.running.scan import first_mixture, report_of, run_of, step_or_predict
 from mpfjax.smoothing.backward import (
     NO_TRANSITION,
     draw,

@@ -13,14 +13,8 @@ from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, require, with_inputs
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
-from mpfjax.models.observations import (
-    as_arrays,
-    present_steps,
-    refusal_of,
-    series_of,
-    steps_of_inputs,
-    with_gaps,
-)
+from mpfjax.models.observations import refusal_of
+from mpfjax.models.series import present_steps, rows_of, series_of, steps_of_inputs, with_gaps
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
@@ -105,7 +99,7 @@ def sample_trajectories(
     if component is not None:
         _check_component(stacked, component)
     if is_marginalised(model) or observations is not None:
-        observations = as_arrays(observations)
+        observations = rows_of(observations)
         present = present_steps(observations, series, refusal_of(model))
         observations = with_gaps(observations, present)
         check_marginalised(model, stacked, observations, method)

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import checked
-from mpfjax.filter import Filter, check_keep_parents
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMove, Step, all_of
+from mpfjax.moves.base import AbstractMove, Step, all_of, check_keep_parents
 from mpfjax.moves.eve_indices import (
     EVE_INDICES,
     EveIndices,

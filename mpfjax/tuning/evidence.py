@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Rule, kinds, warn
-from mpfjax.filter import Filter, check_keep_parents
+from mpfjax.filter import Filter
 from mpfjax.models.base import require, with_inputs
 from mpfjax.models.law import law_of, refuse_marginalised
-from mpfjax.models.observations import Series, as_series, series_of
-from mpfjax.moves.base import AbstractProposal, all_of
+from mpfjax.models.series import Series, as_series, series_of
+from mpfjax.moves.base import AbstractProposal, all_of, check_keep_parents
 from mpfjax.running.results import FilterRun
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from mpfjax.checks import Count, CountOrZero, checked, saying
 from mpfjax.filter import Filter
 from mpfjax.models.base import require
-from mpfjax.models.observations import with_gaps
+from mpfjax.models.series import with_gaps
 from mpfjax.running.long_runs import Checkpoint
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.conditional import (

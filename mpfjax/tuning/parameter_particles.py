@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.observations import Series
+from mpfjax.models.series import Series
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.logarithms import log_sum_exp

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count, checked, kinds
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.observations import Series
+from mpfjax.models.series import Series
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.chains import warn_of_invalid
 from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn

@@ -128,7 +128,7 @@ def islands(row, data):
 def stepped(row, data, after=lambda filter, mixture: (filter, mixture)):
     """The mixtures and increments of one run, step by step."""
     case, filter = row.case(data), row.filter(data)
-    series = mpfjax.models.observations.as_series(case.series, case.model)
+    series = mpfjax.models.series.as_series(case.series, case.model)
     key_initial, key_steps = jax.random.split(KEYS[0])
 
     def at(tree, t):

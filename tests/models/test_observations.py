@@ -7,7 +7,7 @@ import pytest
 
 import mpfjax
 from mpfjax import Series
-from mpfjax.models.observations import as_series
+from mpfjax.models.series import as_series
 from tests import switching
 from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, mean
 from tests.user_models import ScalarLinear, TwoSensors

@@ -11,7 +11,7 @@ from jax import export
 
 import mpfjax
 from mpfjax import smoothing
-from mpfjax.models.observations import Series
+from mpfjax.models.series import Series
 from mpfjax.operations import stored as forms
 from mpfjax.operations.prefix_sums import count_upto, sum_before
 from mpfjax.operations.stored import stored

@@ -14,11 +14,11 @@ from mpfjax.operations.random import (
     normal,
     normal_quantile,
     split,
-    split_for_run,
     split_once,
     threefry,
     uniform,
 )
+from mpfjax.running.keys import split_for_run
 from tests.marking import quick_of
 from tests.precision import float64
 

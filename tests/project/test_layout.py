@@ -24,7 +24,9 @@ FLOORS = {
     "vision": "files colour tracking boxes",
     "lookahead": "quadratics pilot twisted regression learned",
     "robots": "maps motion sensors localisation pose",
-    "running": "storage programs long_runs devices results scan run late islands studies",
+    "running": """
+        storage programs long_runs devices results keys scan diagnosis run late islands studies
+    """,
 }
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

@@ -7,8 +7,8 @@ import yaml
 from PIL import Image
 
 from mpfjax import robots
-from mpfjax.checks import as_numbers
 from mpfjax.models.births import Box, Disc
+from mpfjax.models.series import check_differences
 
 SOLID = np.zeros((60, 60), bool)
 SOLID[[0, -1]] = SOLID[:, [0, -1]] = SOLID[20:40, 20:40] = True
@@ -121,7 +121,7 @@ def test_a_walk_in_degrees_of_longitude_is_refused():
     """Its steps of .1 m are lost in float32; times between observations only seem to differ."""
     walk = 8.4 + 1e-6 * np.cumsum(np.random.default_rng(0).normal(size=50))
     with pytest.raises(ValueError, match=r"y: float32 cannot tell"):
-        as_numbers("y", walk, in_time=True)
+        check_differences("y", walk)
     between = np.diff(1e6 + 0.1 * np.arange(50))
-    assert as_numbers("y", between, in_time=True).dtype == np.float32
-    assert as_numbers("y", 1e4 * (walk - 8.4), in_time=True).dtype == np.float32
+    check_differences("y", between)
+    check_differences("y", 1e4 * (walk - 8.4))

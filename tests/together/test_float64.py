@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.models.observations import Series
+from mpfjax.models.series import Series
 from mpfjax.running.scan import scan
 from tests.marking import quick_of
 from tests.precision import float64

@@ -18,6 +18,7 @@ from mpfjax.arrays import (
 )
 from mpfjax.checks import as_numbers
 from mpfjax.exact import kalman_filter
+from mpfjax.models.series import check_differences
 from mpfjax.vision import Detections
 
 pytestmark = pytest.mark.usefixtures("as_installed")
@@ -99,7 +100,7 @@ def test_differences_that_float32_loses_are_refused_where_arrays_enter(name):
     ],
 )  # fmt: skip
 def test_what_float32_holds_well_enough_is_taken(numbers):
-    as_numbers("x", numbers, in_time=True)
+    check_differences("x", numbers)
 
 
 # By name: a function and numbers, whose differences are of either sign.

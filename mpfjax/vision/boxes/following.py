@@ -13,9 +13,10 @@ from mpfjax.arrays import (
     to_rows,
 )
 from mpfjax.checks import Count, checked
-from mpfjax.filter import Filter, with_densities
+from mpfjax.filter import Filter
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
 from mpfjax.operations.random import split_once
+from mpfjax.report import with_densities
 from mpfjax.vision.boxes.hypotheses import LearnedColourModel, best_components
 from mpfjax.vision.boxes.recipes import objects_filters
 from mpfjax.vision.files.frames import of_one_kind
