@@ -30,7 +30,7 @@ class Step(eqx.Module):
     """y_t; None where it is missing, and most moves then do nothing."""
     inputs: PyTree = eqx.field(default=None, kw_only=True)
     """u_t, the known inputs of the step, from which the model at u_t was made."""
-    initial_model: Any = eqx.field(default=None, kw_only=True)
+    initial_model: PyTree = eqx.field(default=None, kw_only=True)
     """the filter's model without inputs, whose p(x_0) is the prior; None where it is `model`."""
     moves: "Moves" = eqx.field(default=(), kw_only=True)
     """the filter's own chain."""

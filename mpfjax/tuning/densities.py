@@ -27,8 +27,8 @@ class Prior(eqx.Module):
 
     def __call__(self, reals: Reals) -> Float[Array, ""]:
         """The log density, up to the constant that the function leaves out."""
-        density: Any = self.function(
-            {name: self.transforms[name].constrain(u) for name, u in reals.items()}
+        density = jnp.asarray(
+            self.function({name: self.transforms[name].constrain(u) for name, u in reals.items()})
         )
         for name, u in reals.items():
             density += self.transforms[name].log_jacobian(u)
@@ -41,8 +41,8 @@ class Point(eqx.Module):
     reals: Reals
     log_prior: Float[Array, "*n"]  # with the Jacobian; -inf where it is zero or no number
     log_likelihood: Float[Array, "*n"]  # -inf where it is no number, or either is zero
-    mixture: Any = None  # where their filter stands, for samplers that go on with it
-    key_data: Any = None  # of the key of their filter's run, for what makes it again
+    mixture: PyTree = None  # where their filter stands, for samplers that go on with it
+    key_data: Array | None = None  # of the key of their filter's run, for what makes it again
 
     @property
     def log_density(self) -> Float[Array, "*n"]:

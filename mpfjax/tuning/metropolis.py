@@ -27,7 +27,7 @@ class Posterior(PosteriorOfChains):
 
     log_marginal_likelihoods: Float[np.ndarray, "chains draws"]
     """log Ẑ of every draw, summed over sequences."""
-    key_data: Any = field(default=None, repr=False)
+    key_data: PyTree = field(default=None, repr=False)
     """of the key with which the filter ran for each log Ẑ."""
 
 

@@ -2,7 +2,6 @@
 
 from functools import partial
 from itertools import pairwise
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -241,11 +240,12 @@ def sampled_histograms(
     d, channels, num_bins = len(boxes), colours.num_channels, colours.num_bins
     row, down = _points(boxes[:, 1], boxes[:, 3], _ROWS, frame.shape[0])
     column, across = _points(boxes[:, 0], boxes[:, 2], _COLUMNS, frame.shape[1])
-    pixels: Any = np.asarray(frame)[row[:, :, None], column[:, None, :]].reshape(
-        d, _ROWS * _COLUMNS, 3
-    )
+    pixels = np.asarray(frame)[row[:, :, None], column[:, None, :]]
+    pixels = pixels.reshape(d, _ROWS * _COLUMNS, 3)
     shape = d, num_parts, _ROWS * _COLUMNS // num_parts
-    drawn = np.asarray(colours.bins(pixels)).reshape(*shape, channels)
+    drawn = np.asarray(colours.bins(pixels)).reshape(
+        *shape, channels
+    )
     inside = (down[:, :, None] & across[:, None, :]).reshape(*shape, 1)
     place = np.arange(d * num_parts * channels).reshape(d, num_parts, 1, channels)
     weights = np.broadcast_to(inside, drawn.shape).ravel()
