@@ -243,9 +243,7 @@ def sampled_histograms(
     pixels = np.asarray(frame)[row[:, :, None], column[:, None, :]]
     pixels = pixels.reshape(d, _ROWS * _COLUMNS, 3)
     shape = d, num_parts, _ROWS * _COLUMNS // num_parts
-    drawn = np.asarray(colours.bins(pixels)).reshape(
-        *shape, channels
-    )
+    drawn = np.asarray(colours.bins(pixels)).reshape(*shape, channels)
     inside = (down[:, :, None] & across[:, None, :]).reshape(*shape, 1)
     place = np.arange(d * num_parts * channels).reshape(d, num_parts, 1, channels)
     weights = np.broadcast_to(inside, drawn.shape).ravel()
