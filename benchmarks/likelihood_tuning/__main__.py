@@ -66,7 +66,7 @@ def main(
     settings = harness.settings_of(locals())
     others = {
         "gradients": lambda: volatility.gradients(methods, runs, seed),
-        "shifts": lambda: volatility.shifts(methods, series, 2, seed),
+        "shifts": lambda: volatility.shifts(methods, series, max(runs // 5, 2), seed),
         "learned": lambda: volatility.learned(methods, series, data_sets, steps, seed),
         "coverage": lambda: volatility.coverage(
             methods, max(series // 5, 1), data_sets, steps, seed

@@ -152,6 +152,9 @@ def pose_evidence(
     groups: dict[str, list[tuple[int, Series]]] = {}
     for place, sequence in enumerate(sequences):
         series = as_series(sequence, filter.model)
+        if score == "fisher" and series.present is not None and not np.any(series.present):
+            what = f"sequence {place} has none, and its score is zero; omit it"
+            raise ValueError(f'observations: {what}, or use score="filter"')
         kind = kinds((series.observations, series.inputs))
         groups.setdefault(kind, []).append((place, series))
     stacked, places = [], []

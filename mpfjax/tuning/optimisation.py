@@ -15,7 +15,16 @@ from mpfjax.filter import Filter
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.curvature import errors_at
 from mpfjax.tuning.evidence import Score, names_but_proposals, pose_evidence, warn_of_bias
-from mpfjax.tuning.problem import Objective, Parameters, Problem, Reals, Transforms, pose, scores
+from mpfjax.tuning.problem import (
+    Objective,
+    Parameters,
+    Problem,
+    Reals,
+    Transforms,
+    averages,
+    pose,
+    scores,
+)
 
 Optimizer = Annotated[
     optax.GradientTransformation,
@@ -77,9 +86,10 @@ def fit(
 
         log (1 / K Σ_k Ẑ_s(θ; k)),
 
-    over K seeds k. Ẑ is unbiased, and the logarithm of its mean over seeds is biased far less than
-    log Ẑ of one seed, which is below log Z by about half its variance. That variance depends on θ,
-    and over many sequences its effect does not average out. Build the filter with
+    over K seeds k, by its jackknife estimate. Ẑ is unbiased, but log Ẑ of one seed is below log Z
+    by about half its variance. That variance depends on θ, and over many sequences its effect does
+    not average out. The logarithm of the mean over seeds is biased by about 1 / K of that, and the
+    jackknife over seeds (Quenouille 1956) removes most of the rest. Build the filter with
     `gradient="stop"`, whose derivatives estimate the score, or use `score="fisher"`. With neither
     the optimisation ends somewhere else, for any number of particles, and a warning is issued.
 
@@ -283,9 +293,7 @@ class _Ascent:
 
     def _average(self, values: Float[np.ndarray, "seeds series"]) -> float:
         """The average over seeds, summed over series."""
-        if not self.pooled:
-            return float(values.mean(axis=0).sum())
-        return float((np.logaddexp.reduce(values, axis=0) - np.log(len(values))).sum())
+        return float(np.asarray(averages(jnp.asarray(values), self.pooled), float).sum())
 
     def _evaluate(
         self, key: Key[Array, ""], problem: Problem, reals: Reals

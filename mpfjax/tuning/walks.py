@@ -10,9 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.arrays import (
-    POSITIVE,
-)
+from mpfjax.arrays import POSITIVE
 from mpfjax.checks import saying
 from mpfjax.operations.matrices import cholesky
 from mpfjax.tuning.densities import Point, chosen

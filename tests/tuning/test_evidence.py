@@ -100,3 +100,12 @@ def test_parameters_of_a_proposal_have_no_score_by_fishers_identity():
     parameters = {"w": lambda filter: filter.moves[1].proposal.network}
     with pytest.raises(ValueError, match=r'score: "fisher" has no derivative in .* proposal'):
         pose_evidence(filter, SERIES, parameters, None, "fisher")
+
+
+def test_a_sequence_without_observations_is_refused_by_fishers_identity():
+    """The derivative of the likelihood of a missing observation is not a number."""
+    filter = mpfjax.particle_filter(Pushed(), 4)
+    nothing = mpfjax.Series.skipping(np.full(8, np.nan), SERIES.inputs)
+    pose_evidence(filter, [SERIES, nothing], None, None)
+    with pytest.raises(ValueError, match="observations: sequence 1 has none"):
+        pose_evidence(filter, [SERIES, nothing], None, None, "fisher")

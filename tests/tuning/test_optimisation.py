@@ -17,7 +17,7 @@ from mpfjax import Checkpoint
 from mpfjax.exact import kalman_filter
 from mpfjax.tuning import Interval, Positive, fit, standard_errors
 from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
-from mpfjax.tuning.problem import pose, scores
+from mpfjax.tuning.problem import averages, pose, scores
 from tests.user_models import ScalarLinear
 
 OBSERVATIONS = jnp.array([1.5, 0.2, -0.4, 0.8, 1.9, 1.1, 0.3, -0.9])
@@ -111,7 +111,8 @@ STILL = optax.sgd(0.0)
 class TestPooling:
     """Model parameters maximise Σ log mean Ẑ over seeds; a proposal's, the mean of log Ẑ."""
 
-    def test_the_gradient_weighs_the_seeds_of_a_series_by_their_likelihood(self):
+    def test_the_objective_is_the_jackknife_of_the_log_of_the_mean(self):
+        """3 log (1/3 Σ Ẑ) - 2 times its mean over pairs of seeds, and the gradient of that."""
         problem = pose_evidence(small(8), SEVERAL, NOISE, {"r": Positive()})
         reals, keys = problem.start(), jax.random.split(jax.random.key(0), 3)
 
@@ -119,12 +120,40 @@ class TestPooling:
             return jax.vmap(lambda key: problem.objective(key, problem.at({"r": u})))(keys)
 
         each, slopes = np.asarray(values(reals["r"])), np.asarray(jax.jacfwd(values)(reals["r"]))
-        weights = np.exp(each) / np.exp(each).sum(axis=0)
-        for pooled, expected in ((True, (weights * slopes).sum()), (False, slopes.sum() / 3)):
+        whole, pairs = [0, 1, 2], ([0, 1], [0, 2], [1, 2])
+
+        def log_mean(seeds):
+            return np.log(np.exp(each[seeds]).mean(axis=0))
+
+        def slope(seeds):
+            weights = np.exp(each[seeds]) / np.exp(each[seeds]).sum(axis=0)
+            return (weights * slopes[seeds]).sum()
+
+        expected = {False: (each.mean(axis=0), slopes.sum() / 3)}
+        expected[True] = tuple(
+            3 * f(whole) - 2 / 3 * sum(f(pair) for pair in pairs) for f in (log_mean, slope)
+        )
+        assert not np.allclose(*(value for value, _ in expected.values()), atol=0.01)
+        for pooled, (value, derivative) in expected.items():
             found, gradient = scores(keys, problem, reals, pooled)
             np.testing.assert_allclose(found, each, rtol=1e-5)
-            assert float(gradient["r"]) == pytest.approx(expected, rel=1e-4)
-        assert np.abs(weights - 1 / 3).max() > 0.05
+            np.testing.assert_allclose(averages(found, pooled), value, rtol=1e-4)
+            assert float(gradient["r"]) == pytest.approx(derivative, rel=1e-3)
+
+    def test_its_bias_is_a_quarter_of_that_of_the_logarithm_of_the_mean(self):
+        """Of lognormal Ẑ with E Ẑ = 1, where log Ẑ has a standard deviation of .7."""
+        noise = 0.7 * np.random.default_rng(0).normal(size=(8, 100_000)) - 0.245
+        plain = np.log(np.exp(noise).mean(axis=0)).mean()
+        found = np.asarray(averages(jnp.asarray(noise), True), float)
+        standard = found.std() / np.sqrt(found.size)
+        assert plain < -30 * standard
+        assert abs(found.mean()) < abs(plain) / 4 + 4 * standard
+
+    def test_a_seed_far_above_the_others_has_a_finite_value_and_gradient(self):
+        values = jnp.array([[0.0], [-1e3], [-2e3]])
+        value, gradient = jax.value_and_grad(lambda v: averages(v, True)[0])(values)
+        assert jnp.isfinite(value)
+        np.testing.assert_allclose(jnp.sum(gradient), 1.0, rtol=1e-5)
 
     def test_its_value_and_the_seeds_that_count_are_those_of_each_series(self):
         options = {"observations": SEVERAL, "optimizer": STILL, "start": {"num_particles": 4}}
