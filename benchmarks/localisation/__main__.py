@@ -19,8 +19,7 @@ A run is localised where more than half of the distribution is within .6 m (in a
   then;
 - `ROC`: the area under the ROC curve of the filter's own probability of not being localised, over
   all scans from the eighth on; for AMCL of its measure 1 - w_fast / w_slow;
-- `in walls`: the largest probability, in the first drive, of an occupied cell or a place off the
-  map;
+- `in walls`: the largest probability, at any scan, of an occupied cell or a place off the map;
 - `ms`: CPU time per scan, the median over runs, with starts and restarts;
 - `sd of log Z`: of the first drive, between runs of the same drive.
 
@@ -129,7 +128,7 @@ class Found(NamedTuple):
     lost: np.ndarray | None
     """The filter's own measure at each step, (runs, t)."""
     in_walls: float
-    """The most of the distribution in occupied cells or off the map, in the first drive."""
+    """The most of the distribution in occupied cells or off the map."""
     milliseconds: np.ndarray
 
 
@@ -150,9 +149,8 @@ def found_of(name: str, scene: Scene, drive: Stretch, runs: Runs) -> Found:
     in_walls = 0.0
     if isinstance(scene.model, robots.RobotModel):
         grid = scene.model.grid
-        first = np.s_[:, : scene.carried]
-        walls = np.asarray(grid.at(jnp.asarray(particles[first][..., :2]), grid.occupied, True))
-        in_walls = float(np.max(np.sum(weights[first], axis=-1, where=walls)))
+        walls = np.asarray(grid.at(jnp.asarray(particles[..., :2]), grid.occupied, True))
+        in_walls = float(np.max(np.sum(weights, axis=-1, where=walls)))
     log_z = np.sum(runs.increments[:, : scene.carried], axis=1)
     return Found(right, log_z, masses, runs.lost, in_walls, runs.milliseconds)
 

@@ -24,6 +24,7 @@ from mpfjax.checks import (
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.gaussians import log_normal
 from mpfjax.operations.random import normal, split, uniform
+from mpfjax.operations.rows import select_rows
 from mpfjax.robots.maps import OccupancyGrid, Poses
 from mpfjax.robots.motion import wrap
 from mpfjax.robots.sensors import POSE
@@ -51,9 +52,10 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
 
     Inputs are odometry, one step (forward, left, turn) in the robot's frame at a time, see
     `odometry_steps`, and observations are scans (k,), in which some beams may be missing. The robot
-    may be where the map is free or unknown. The likelihood of a pose in an occupied cell or off the
-    map is zero: a step that moves all particles there is `degenerate`, and its particles keep their
-    weights. `starts` are the corners of the cells of x_0.
+    may be where the map is free or unknown, and nowhere else: a step that ends in an occupied cell
+    or off the map only turns it, so that a filter that lost the robot has no particles in walls,
+    and the likelihood of a draw of x_0 in a wall is zero. `starts` are the corners of the cells of
+    x_0.
 
     Raises `ValueError` if no cell is free, and for an `initial_pose` off the map, in an occupied
     cell, or with coordinates that float32 cannot resolve. Warns of inputs that look like poses.
@@ -145,10 +147,12 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
         return self.motion.noise_dimension
 
     def transition_from_noise(self, noise: Float[Array, "n k"], states: Poses) -> Poses:
-        """x_t, after the step of the odometry."""
+        """x_t, after the step of the odometry, or its turn alone where a wall is in the way."""
         if self.inputs is None:
             raise ValueError("inputs: None, but a RobotModel needs odometry, a row for each step")
-        return self.motion.from_noise(noise, states, self.inputs)
+        moved = self.motion.from_noise(noise, states, self.inputs)
+        places = select_rows(self._may_be_at(moved), moved[:, :2], states[:, :2])
+        return jnp.concatenate([places, moved[:, 2:]], axis=1)
 
     def log_likelihood(self, observation: Float[Array, " k"], states: Poses) -> Float[Array, " n"]:
         """log p of a scan at each pose."""

@@ -271,7 +271,7 @@ def test_cubes_are_those_of_amcl():
 
 
 def test_a_robot_is_in_no_wall_and_may_be_where_the_map_is_unknown():
-    """Free, unknown, occupied, off the map."""
+    """Free, unknown, occupied, off the map; a step into a wall or off the map only turns it."""
     poses = jnp.array([[0.5, 2.55, 0], [-0.5, 4.65, 0], [1.2, 3.0, 0], [9.0, 3.0, 0]])
     logs = np.asarray(robot().log_likelihood(SCAN, poses))
     assert np.isfinite(logs).tolist() == [True, True, False, False]
@@ -282,10 +282,15 @@ def test_a_robot_is_in_no_wall_and_may_be_where_the_map_is_unknown():
     )  # fmt: skip
     filter = mpfjax.particle_filter(model, 100)
     mixture = filter.init(jax.random.key(0))
-    for forward, is_degenerate in ((0.3, True), (0.0, False)):
-        step = jnp.array([forward, 0.0, 0.0])
-        info = filter.step(jax.random.key(1), mixture, SCAN, inputs=step)[1]
-        assert bool(info.degenerate) == is_degenerate
+    for forward in (0.3, 0.3, 9.0):
+        before, step = mixture.particles, jnp.array([forward, 0.0, 0.1])
+        mixture, info = filter.step(jax.random.key(1), mixture, SCAN, inputs=step)
+        assert not info.degenerate
+        np.testing.assert_allclose(GRID.at(mixture.particles[:, :2], GRID.occupied, True), False)
+        places = {tuple(place) for place in np.asarray(before[:, :2])}
+        assert {tuple(place) for place in np.asarray(mixture.particles[:, :2])} <= places
+        turned = np.mean(mixture.particles[:, 2]) - np.mean(before[:, 2])
+        assert turned == pytest.approx(0.1, abs=0.01)
 
 
 @pytest.mark.parametrize(
