@@ -19,6 +19,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -147,6 +148,8 @@ def compare(
     """Seconds of both by the processor and by the clock, (turns, 2), of each part; raises where
     their answers differ.
     """
+    # Of runs without resampling, which are meant to degenerate.
+    warnings.simplefilter("ignore", RuntimeWarning)
     ours = through_parts(job, by_hand.num_particles)
     # The first turn compiles; what it is given says whether both agree.
     keys = [jax.random.split(jax.random.key(turn), num_seeds) for turn in range(1 + repeats)]

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.arrays import (
     POSITIVE,
@@ -75,8 +75,7 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
 
     def __init__(
         self, grid: Any, motion: Any, sensor: Any, *, clearance: float = 0.0,
-        initial_pose: ArrayLike | None = None,
-        initial_deviations: Any = (0.5, 0.5, np.pi / 12),
+        initial_pose: Any = None, initial_deviations: Any = (0.5, 0.5, np.pi / 12),
         inputs: PyTree = None,
     ) -> None:  # fmt: skip
         check(OccupancyGrid, grid=grid)
