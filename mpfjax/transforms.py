@@ -211,17 +211,10 @@ def with_restarts(
     - `num_observations`: L: as many as distinguish the modes. It is also the number for
       `with_initialisation`.
     """
-    alarms = [move for move in filter.moves if isinstance(move, WatchStart)]
-    alarms += [move for move in _restarts(filter) if move.probability is not None]
-    num_particles = [*(move.num_particles for move in alarms), filter.num_particles][0]
-    others = [move for move in filter.moves if not isinstance(move, WatchStart)]
-    filter = filter.replace(moves=others)
-    return _with_restart(
-        filter,
-        num_observations=num_observations,
-        probability=probability,
-        num_particles=num_particles,
-    )
+    alarms = [move for move in filter.moves if isinstance(move, WatchStart | Restart)]
+    if not any(move.num_particles for move in alarms):
+        filter = with_alarm(filter, filter.num_particles)
+    return _with_restart(filter, num_observations=num_observations, probability=probability)
 
 
 def _restarts(filter: Filter) -> list[Restart]:
@@ -229,13 +222,18 @@ def _restarts(filter: Filter) -> list[Restart]:
 
 
 def _with_restart(filter: Filter, **settings: Any) -> Filter:
-    """The filter whose `Restart` has these settings, after the last move that does not regroup."""
-    if _restarts(filter):
-        return _change_in_chain(filter, Restart, lambda move: dataclasses.replace(move, **settings))
-    place = 1 + max(t for t, move in enumerate(filter.moves) if not _regroups(move))
-    grouping = [move for move in filter.initial_moves if _regroups(move)]
-    restart = Restart(grouping, **settings)
-    return filter.replace(moves=[*filter.moves[:place], restart, *filter.moves[place:]])
+    """The filter whose `Restart`, after the last move that does not regroup, has these settings.
+
+    An alarm of the filter is part of it.
+    """
+    if not _restarts(filter):
+        alarms = [move.num_particles for move in filter.moves if isinstance(move, WatchStart)]
+        moves = [move for move in filter.moves if not isinstance(move, WatchStart)]
+        place = 1 + max(t for t, move in enumerate(moves) if not _regroups(move))
+        grouping = [move for move in filter.initial_moves if _regroups(move)]
+        restart = Restart(grouping, num_particles=sum(alarms))
+        filter = filter.replace(moves=[*moves[:place], restart, *moves[place:]])
+    return _change_in_chain(filter, Restart, lambda move: dataclasses.replace(move, **settings))
 
 
 def _regroups(move: AbstractMove) -> bool:
@@ -253,10 +251,8 @@ def with_alarm(filter: Filter, num_particles: Count = 4096) -> Filter:
     prior. It is estimated from `num_particles` draws of x_0, the same at each step, which take as
     long as so many particles. Use it if a lost target must be noticed.
     """
-    if any(move.probability is not None for move in _restarts(filter)):
-        return _change_in_chain(
-            filter, Restart, lambda move: dataclasses.replace(move, num_particles=num_particles)
-        )
+    if _restarts(filter):
+        return _with_restart(filter, num_particles=num_particles)
     others = [move for move in filter.moves if not isinstance(move, WatchStart)]
     return filter.replace(moves=[*others, WatchStart(num_particles)])
 

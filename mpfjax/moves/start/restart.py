@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count, CountOrZero, InnerShare
 from mpfjax.memory import Memory
-from mpfjax.mixture import BEGAN_ANEW, ParticleMixture, single_component
+from mpfjax.mixture import BEGAN_ANEW, ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractWrapper, Moves, Step, as_moves, in_turn
 from mpfjax.moves.initial import require_propagation
 from mpfjax.moves.start.alarm import Alarm
@@ -26,7 +26,7 @@ from mpfjax.operations.islands import num_islands, over_islands
 from mpfjax.operations.logarithms import default_float, finite_or_zero, log_sum_exp
 from mpfjax.operations.random import split
 from mpfjax.operations.rows import select_rows
-from mpfjax.operations.stored import cond_if_any
+from mpfjax.operations.stored import cond_if_any, take
 
 # In the memory.
 RECENT = "the last observations"
@@ -40,22 +40,19 @@ class RecentSteps(Memory):
     - `window`: their data; its leaves are None until the first step shows their shapes.
     - `log_increments`: the evidence of each, as a restart has to replace it.
     - `is_impossible`: which had no likelihood under any hypothesis.
-    - `log_evidence`: what the step adds to log Ẑ if the state has been drawn anew in it.
-    - `is_renewed`: whether it has.
     - `age`: the steps since the alarm's sum was zero, the oldest that a restart goes back to.
     - `alarm`: None where nothing restarts.
     - `is_rushed`: whether some sample of a window was poor.
+    - `report`: what the last step adds to its report.
     """
 
     window: Window
     log_increments: Float[Array, " steps"]
     is_impossible: Bool[Array, " steps"]
-    log_evidence: Float[Array, ""]
-    is_renewed: Bool[Array, ""]
     age: Int[Array, ""]
     is_rushed: Bool[Array, ""]
     alarm: Alarm | None
-    probability: float = eqx.field(static=True)
+    report: dict[str, Array]
     start: int = eqx.field(static=True)
     """the step of the run at which the state is drawn anew in any case; 0 for none."""
 
@@ -77,61 +74,53 @@ class RecentSteps(Memory):
         message = f"the likelihood is too narrow for {sampler}, which ran out of powers"
         return message if np.any(self.is_rushed) else ""
 
-    def with_step(self, now: Step) -> "RecentSteps":
+    def after_step(
+        self, mixture: ParticleMixture, now: Step
+    ) -> tuple["RecentSteps", dict[str, PyTree]]:
+        """What the move found in this step."""
+        return self, self.report
+
+    def with_step(self, now: Step, log_increment: Float[Array, ""]) -> "RecentSteps":
         """The steps with one more, without the oldest; a missing observation is not present."""
-        is_present = jnp.asarray(now.is_present)
-        data = Window(now.observation, now.inputs, is_present)
+        length = self.log_increments.shape[0]
         observations, inputs, present = (
-            old if new is None else _push(old, new, self.log_increments.shape[0])
-            for old, new in zip(self.window, data, strict=True)
+            old if new is None else _push(old, new, length)
+            for old, new in zip(
+                self.window, (now.observation, now.inputs, now.is_present), strict=True
+            )
         )
         if not now.is_present:
             observations = jax.tree.map(partial(jnp.roll, shift=-1, axis=0), observations)
         return dataclasses.replace(
             self,
             window=Window(observations, inputs, present),
-            log_increments=jnp.roll(self.log_increments, -1),
-            is_impossible=jnp.roll(self.is_impossible, -1).at[-1].set(False),
-            is_renewed=jnp.zeros((), bool),
+            log_increments=_push(self.log_increments, log_increment, length),
+            is_impossible=_push(self.is_impossible, log_increment == -jnp.inf, length),
         )
 
-    def after_step(
-        self, mixture: ParticleMixture, now: Step
-    ) -> tuple["RecentSteps", dict[str, PyTree]]:
-        """Reports the evidence of a state drawn anew, and none before the first such step."""
-        assert mixture.within is not None
-        increment, additions = mixture.within.log_increment, {}
-        is_impossible = (increment == -jnp.inf) & ~self.is_renewed
-        against = jnp.zeros_like(increment)
-        if self.alarm is not None and now.is_present:
-            against = self.alarm.log_evidence(now)
-            # No hypothesis explains y_t but that the state began anew.
-            increment = jnp.where(is_impossible, np.log(self.probability) + against, increment)
-        increment = jnp.where(self.is_renewed, self.log_evidence, increment)
-        # At a start it is known of each step.
-        last = increment
-        if self.start:
-            last = jnp.where(mixture.t == self.start, self.log_increments[-1], increment)
-        alarm, age = self.alarm, self.age
-        if alarm is not None:
-            against = jnp.where(now.is_present, against - jax.lax.stop_gradient(last), 0.0)
-            alarm = alarm.heard(against)
-            alarm = Alarm(jnp.where(mixture.t > self.start, alarm.total, 0.0), alarm.num_particles)
-            age = jnp.where(self.is_renewed, -1, age)
-            age = jnp.where(alarm.total > 0, age + 1, 0).astype(jnp.int32)
-            additions |= {"log_evidence_against_start": against, "alarm": alarm.rings}
+    def reported(
+        self,
+        mixture: ParticleMixture,
+        now: Step,
+        log_evidence: Float[Array, ""],
+        increment: Float[Array, ""],
+    ) -> "RecentSteps":
+        """The memory after a step with this increment, and this evidence of one from x_0."""
+        # At a start, the increment is of all steps, but the evidence of each is in the memory.
+        last = jnp.where(mixture.t == self.start, self.log_increments[-1], increment)
         is_early = mixture.t < self.start
-        reported = jnp.where(is_early, 0.0, increment)
-        is_degenerate = (is_impossible | (reported == -jnp.inf)) & ~is_early
-        additions |= {"log_likelihood_increment": reported, "degenerate": is_degenerate}
-        new = dataclasses.replace(
-            self,
-            log_increments=self.log_increments.at[-1].set(jax.lax.stop_gradient(last)),
-            is_impossible=self.is_impossible.at[-1].set(is_impossible),
-            age=age,
-            alarm=alarm,
+        is_degenerate = (self.is_impossible[-1] | (increment == -jnp.inf)) & ~is_early
+        alarm, age, report = self.alarm, self.age, {"degenerate": is_degenerate}
+        if alarm is not None:
+            against = log_evidence - last if now.is_present else jnp.zeros_like(last)
+            # Before, the hypotheses are those that the start replaces.
+            alarm = alarm.heard(jnp.where(mixture.t > self.start, against, 0.0))
+            age = jnp.where(alarm.total > 0, age + 1, 0)
+            report |= {"log_evidence_against_start": against, "alarm": alarm.rings}
+        log_increments = self.log_increments.at[-1].set(last)
+        return dataclasses.replace(
+            self, log_increments=log_increments, age=age, alarm=alarm, report=report
         )
-        return new, additions
 
 
 class Restart(AbstractWrapper):
@@ -154,7 +143,7 @@ class Restart(AbstractWrapper):
     - `num_observations`: L.
     - `at_start`: whether the filter is initialised at step L of a run.
     - `probability`: p; None never restarts.
-    - `num_particles`: draws of x_0 of the alarm.
+    - `num_particles`: draws of x_0 of the alarm; 0 for a start without an alarm.
 
     `with_initialisation` and `with_restarts` make filters with it. Raises `ValueError` in a filter
     of a model without a density of x_0 in floating point, of a conditionally linear model, and for
@@ -168,7 +157,6 @@ class Restart(AbstractWrapper):
     num_particles: CountOrZero = eqx.field(static=True, default=0)
 
     holds = ("grouping",)
-    approximate = False
     weighs = True
     keeps_mass = True
     keeps_parents = False
@@ -176,139 +164,135 @@ class Restart(AbstractWrapper):
     keeps_families = False
     biases_score = True
     """derivatives do not see the sampler."""
+    # A trajectory cannot be kept where the state begins anew.
+    around = AbstractMove.around
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model whose x_0 cannot be moved, and too few particles."""
         super().check(now, num_particles, num_components)
         check_initial_density(now.model, "a state drawn anew from observations")
         least = least_slots(num_particles)
-        if self.probability is not None:
+        if self.num_particles:
             require_propagation(now, "draws of x_0 are compared")
-            if num_components > least:
-                which = f"of which {least} may be all of the slots of {num_components} components"
-                raise ValueError(f"num_particles: {num_particles}, {which}")
-
-    def around(self, reference: Any) -> AbstractMove:
-        """Raise a `ValueError`: a trajectory cannot be kept where the state begins anew."""
-        raise ValueError("filter: with_initialisation and with_restarts cannot keep a trajectory")
+        if self.probability is not None and num_components > least:
+            which = f"of which {least} may be all of the slots of {num_components} components"
+            raise ValueError(f"num_particles: {num_particles}, {which}")
 
     def initial_memory(self, now: Step, num_components: int) -> dict[str, PyTree]:
         """Room for L steps."""
-        length = self.num_observations
+        length, no, zero = self.num_observations, jnp.zeros((), bool), jnp.zeros(())
         room = partial(_room, length=length)
-        window = Window(room(now.observation), room(now.inputs), jnp.zeros(length, bool))
-        has_alarm = self.probability is not None
+        alarm, report = None, {"degenerate": no}
+        if self.num_particles:
+            alarm = Alarm(zero, self.num_particles)
+            report |= {"log_evidence_against_start": zero, "alarm": no}
         recent = RecentSteps(
-            window=window,
-            log_increments=jnp.zeros(length, default_float()),
-            is_impossible=jnp.zeros(length, bool),
-            log_evidence=jnp.zeros((), default_float()),
-            is_renewed=jnp.zeros((), bool),
+            window=Window(room(now.observation), room(now.inputs), room(no)),
+            log_increments=room(jnp.zeros((), default_float())),
+            is_impossible=room(no),
             age=jnp.zeros((), jnp.int32),
-            is_rushed=jnp.zeros((), bool),
-            alarm=Alarm(jnp.zeros(()), self.num_particles) if has_alarm else None,
-            probability=self.probability or 0.0,
+            is_rushed=no,
+            alarm=alarm,
+            report=report,
             start=length if self.at_start else 0,
         )
         return super().initial_memory(now, num_components) | {RECENT: recent}
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
-        """The mixture with the state drawn anew, where it is due."""
+        """The mixture with the state drawn anew, where it is due, and the increment of the step."""
         if mixture.usable_slots is not None:
             raise ValueError("num_slots: with_initialisation and with_restarts need every slot")
-        recent = mixture.memory[RECENT].with_step(now)
-        mixture = mixture.replace(memory=mixture.memory | {RECENT: recent}).with_order(False)
-        is_due = is_start = jnp.asarray(self.at_start) & (mixture.t == self.num_observations)
+        increment = _increment(mixture)
+        recent = mixture.memory[RECENT].with_step(now, increment)
+        is_due, log_evidence = mixture.t == recent.start, jnp.zeros_like(increment)
         if recent.alarm is not None and now.is_present:
-            is_late = recent.age + 1 >= self.num_observations
-            is_due |= recent.alarm.rings & is_late & (mixture.t > recent.start)
-        elif not self.at_start:
-            return mixture
-
-        def renew() -> ParticleMixture:
-            new = self._renew(key, mixture, now, is_start)
-            return jax.tree.map(lambda new, old: jnp.where(is_due, new, old), new, mixture)
-
-        return cond_if_any(is_due, renew, lambda: mixture)
+            log_evidence = recent.alarm.log_evidence(now)
+            if (p := self.probability) is not None:
+                # No hypothesis explains y_t but that the state began anew.
+                increment = jnp.where(recent.is_impossible[-1], np.log(p) + log_evidence, increment)
+                is_late = recent.age + 1 >= self.num_observations
+                is_due |= recent.alarm.rings & is_late & (mixture.t > recent.start)
+        mixture = _with_recent(mixture.with_order(False), recent, increment)
+        if self.at_start or (self.probability is not None and now.is_present):
+            mixture = cond_if_any(
+                is_due, partial(self._renew, key, mixture, now, is_due), lambda: mixture
+            )
+        recent, increment = mixture.memory[RECENT], _increment(mixture)
+        recent = recent.reported(mixture, now, log_evidence, increment)
+        return _with_recent(mixture, recent, jnp.where(mixture.t < recent.start, 0.0, increment))
 
     def _renew(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step, is_start: Bool[Array, ""]
+        self, key: Key[Array, ""], old: ParticleMixture, now: Step, is_due: Bool[Array, ""]
     ) -> ParticleMixture:
-        """The mixture of the particles drawn anew, and at a restart of those that there are."""
-        key_sample, key_join, key_group = split(key, 3)
-        recent: RecentSteps = mixture.memory[RECENT]
-        n, model = mixture.num_particles, now.model
-        if now.initial_model is not None:
-            model = now.initial_model
-        sample = sample_window(key_sample, model, recent.window, n)
-        alone = single_component(sample.states, mixture.num_components).replace(
-            ancestor_indices=jnp.full(n, BEGAN_ANEW, jnp.int32), memory=mixture.memory, t=mixture.t,
-            within=mixture.within, waits=mixture.waits,
-        )  # fmt: skip
-        log_z = jnp.sum(sample.log_increments)
-        start = alone.replace(log_scale=log_z - np.log(num_islands()))
-        log_increments = sample.log_increments
-        moved, log_old_increment = start, jnp.zeros_like(log_z)
-        if self.probability is not None:
-            assert mixture.within is not None
-            growth = jax.lax.stop_gradient(mixture.within.log_increment)
-            # The evidence of each step by the old hypotheses, or where it is zero, by the new ones.
-            old_increments = recent.log_increments.at[-1].set(growth)
-            old_increments = jnp.where(
-                old_increments > -jnp.inf, old_increments, finite_or_zero(sample.log_increments)
-            )
-            is_impossible = jnp.any(recent.is_impossible) | (growth == -jnp.inf)
-            log_odds = jnp.sum(sample.log_increments - old_increments)
-            both = self._join(key_join, mixture, alone, log_odds, is_impossible)
-            moved = jax.tree.map(partial(jnp.where, is_start), start, both)
-            log_old_increment = jnp.where(is_start, 0.0, old_increments[-1])
-            log_increments = jnp.where(is_start, sample.log_increments, old_increments)
-        moved, log_growth = moved.normalised(mixture)
-        recent = dataclasses.replace(
-            recent,
-            log_increments=log_increments,
-            is_impossible=jnp.zeros_like(recent.is_impossible),
-            log_evidence=log_old_increment + log_growth,
-            is_renewed=jnp.ones((), bool),
-            is_rushed=recent.is_rushed | sample.is_rushed,
-        )
-        moved = moved.replace(memory=moved.memory | {RECENT: recent})
-        # Grouping, as of x_0, waits for no observation.
-        return in_turn(key_group, self.grouping, moved, dataclasses.replace(now, is_initial=True))
+        """The particles drawn anew, all at a start, and at a restart beside those that there are.
 
-    def _join(
-        self,
-        key: Key[Array, ""],
-        old: ParticleMixture,
-        new: ParticleMixture,
-        log_odds: Float[Array, ""],
-        is_impossible: Bool[Array, ""],
-    ) -> ParticleMixture:
-        """The hypotheses with 1 - p of the weight, and the new ones with p times their odds.
-
-        Each are resampled to their slots; the new ones get label 0, until they are grouped.
+        At a restart, the existing ones have 1 - p of the weight, and the new ones p times the odds
+        of the window's evidence. Each are resampled to their slots; the new ones get label 0, until
+        they are grouped.
         """
-        n, p = old.num_particles, self.probability or 0.0
-        log_old = old.log_mass + jnp.where(is_impossible, -jnp.inf, np.log1p(-p))
-        log_new = np.log(p) + log_odds - np.log(num_islands())
+        key_sample, key_join, key_group = split(key, 3)
+        recent: RecentSteps = old.memory[RECENT]
+        n, p, is_start = old.num_particles, self.probability, old.t == recent.start
+        log_p, log_rest = (0.0, -np.inf) if p is None else (np.log(p), np.log1p(-p))
+        model = now.model if now.initial_model is None else now.initial_model
+        sample = sample_window(key_sample, model, recent.window, n)
+        # The evidence of each step by the old hypotheses, or where it is zero, by the new ones.
+        is_possible = recent.log_increments > -jnp.inf
+        old_increments = jnp.where(
+            is_possible, recent.log_increments, finite_or_zero(sample.log_increments)
+        )
+        old_increments = jnp.where(is_start, 0.0, old_increments)
+        log_odds = jnp.sum(sample.log_increments - old_increments)
+        # At a start its evidence may be of any size, and is kept apart from the weights.
+        log_scale = jnp.where(is_start, log_odds - np.log(num_islands()), 0.0)
+        log_new = jnp.where(is_start, 0.0, log_p + log_odds - np.log(num_islands()))
+        is_lost = is_start | jnp.any(recent.is_impossible)
+        log_old = old.log_mass + jnp.where(is_lost, -jnp.inf, log_rest)
         # In proportion to both over all islands.
         share = jax.nn.sigmoid(_over_all_islands(log_new) - _over_all_islands(log_old))
         least = least_slots(n)
         number = jnp.clip(jnp.round(jnp.nan_to_num(share, nan=0.5) * n), least, n - least)
-        number = number.astype(jnp.int32)
+        number = jnp.where(is_start, n, number.astype(jnp.int32))
         # New ones are as good as each other, old ones are drawn by their weights.
         slot, num_old = jnp.arange(n, dtype=jnp.int32), n - number
-        is_new = slot >= num_old
-        new = new.at(jnp.minimum((slot - num_old) * n // number, n - 1))
-        old = old.at(systematic_sample(key, old.log_weights, num_old))
+        is_new, place = slot >= num_old, jnp.clip((slot - num_old) * n // number, 0, n - 1)
+        new = jax.tree.map(lambda leaf: take(leaf, place), sample.states)
+        joined = old.at(systematic_sample(key_join, old.log_weights, num_old))
         log_weights = jnp.where(is_new, log_new - jnp.log(number), log_old - jnp.log(num_old))
-        particles = select_rows(is_new, new.particles, old.particles)
-        return old.with_resampled(old.active).replace(
-            particles=particles,
+        joined = joined.with_resampled(joined.active).replace(
+            particles=select_rows(is_new, new, joined.particles),
             log_weights=log_weights.astype(old.log_weights.dtype),
-            component_indicators=jnp.where(is_new, 0, old.component_indicators),
-            ancestor_indices=jnp.where(is_new, BEGAN_ANEW, old.ancestor_indices),
+            component_indicators=jnp.where(is_new, 0, joined.component_indicators),
+            ancestor_indices=jnp.where(is_new, BEGAN_ANEW, joined.ancestor_indices),
+            log_scale=log_scale,
         )
+        moved, log_growth = joined.normalised(old)
+        recent = dataclasses.replace(
+            recent,
+            log_increments=jnp.where(is_start, sample.log_increments, old_increments),
+            is_impossible=jnp.zeros_like(recent.is_impossible),
+            age=jnp.full_like(recent.age, -1),
+            is_rushed=recent.is_rushed | sample.is_rushed,
+        )
+        moved = _with_recent(moved, recent, old_increments[-1] + log_growth)
+        # Grouping, as of x_0, waits for no observation.
+        moved = in_turn(key_group, self.grouping, moved, dataclasses.replace(now, is_initial=True))
+        return jax.tree.map(partial(jnp.where, is_due), moved, old)
+
+
+def _increment(mixture: ParticleMixture) -> Float[Array, ""]:
+    """What the step has added to log Ẑ so far."""
+    assert mixture.within is not None
+    return mixture.within.log_increment
+
+
+def _with_recent(
+    mixture: ParticleMixture, recent: RecentSteps, increment: Float[Array, ""]
+) -> ParticleMixture:
+    """The mixture of a step with this increment so far, and these last steps."""
+    assert mixture.within is not None
+    within = dataclasses.replace(mixture.within, log_increment=increment)
+    return mixture.replace(memory=mixture.memory | {RECENT: recent}, within=within)
 
 
 def least_slots(num_particles: int) -> int:

@@ -212,6 +212,18 @@ def test_a_start_and_restarts_are_one_whichever_comes_first():
     assert sum(isinstance(move, Restart) for move in both[0].moves) == 1
     alarms = mpfjax.with_alarm(FILTER, 30), restarts(mpfjax.with_alarm(START, 30))
     assert eqx.tree_equal(*alarms)
+    starts = mpfjax.with_alarm(START), mpfjax.with_initialisation(mpfjax.with_alarm(PLAIN), LENGTH)
+    assert eqx.tree_equal(*starts)
+
+
+@pytest.mark.exactness
+def test_an_alarm_begins_where_the_start_ends():
+    """What it replaces explains nothing, and its increment is of all steps."""
+    filter = mpfjax.with_alarm(START, 100)
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 20), filter, SEEN, mean)
+    assert not np.asarray(runs.alarm).any()
+    against = np.asarray(runs.log_evidence_against_start)
+    assert (against[:, LENGTH - 1 :].max(axis=1) < 0).all()
 
 
 def test_what_cannot_begin_so_is_refused():
