@@ -84,11 +84,11 @@ def conditional_filter(
     each other.
 
     Raises `ValueError` for a filter that is not a chain of regrouping moves, `Resample`,
-    `AuxiliaryResample`, `Propagate`, `Predict`, `Reweight` and `Every` of these; a conditionally
-    linear model; a proposal without `log_density`; noise that is not independent; a model without
-    `log_transition`, unless `backward` is false; a trajectory of other shapes or types than the
-    model's states, or of density zero (NaN within jit). Use it in your own Gibbs sampler;
-    `mpfjax.tuning.particle_gibbs` is one for parameters.
+    `AuxiliaryResample`, `Propagate`, `Predict`, `Reweight` and `Every` of these, also initially; a
+    conditionally linear model; a proposal without `log_density`; noise that is not independent; a
+    model without `log_transition`, unless `backward` is false; a trajectory of other shapes or
+    types than the model's states, or of density zero (NaN within jit). Use it in your own Gibbs
+    sampler; `mpfjax.tuning.particle_gibbs` is one for parameters.
     """
     check_conditional(filter, backward, "conditional_filter")
     series = as_series(observations, filter.model)
@@ -178,7 +178,12 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
     refuse_marginalised(filter.model, needed_by, "metropolis_hastings and smc2 take it as it is")
     if backward:
         require(filter.model, "log_transition", f"backward sampling in {needed_by}")
-    moves = [move.around(Reference(None, jnp.zeros((), jnp.int32))) for move in filter.moves]
+    reference = Reference(None, jnp.zeros((), jnp.int32))
+    for move in filter.initial_moves:
+        # What selects x_0 exactly is left out.
+        if move.approximate or not move.weighs:
+            move.around(reference)
+    moves = [move.around(reference) for move in filter.moves]
     number = sum(isinstance(move, ConditionalPropagation) for move in moves)
     if number != 1:
         raise ValueError(f"filter: {needed_by} needs one Propagate or Predict, not {number}")

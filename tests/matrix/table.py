@@ -129,8 +129,11 @@ RULES = (
          "conditional SMC and particle Gibbs support only `Resample`, `Propagate` and regrouping",
          filters=GAUSSIAN | OF_OBJECTS | METROPOLIS | BEGUN
          | these("point sets", "two draws", "PropagateNested", "Bernoulli",
-                 "PropagateRegimes", "own function", "Prune", "Exclusion"),
+                 "PropagateRegimes", "own function", "initially own function", "Prune",
+                 "Exclusion"),
          questions=OF_PATHS),
+    Rule("log_initial", "`particle_gibbs` with a `log_prior` needs a density of x_0, which a "
+         "`MultiObjectModel` has not", forms=these("one of several"), questions=these("Gibbs")),
     Rule("unbiased likelihood",
          "`metropolis_hastings` and `smc2` refuse filters that are `approximate`",
          filters=APPROXIMATE, questions=UNBIASED),

@@ -132,6 +132,15 @@ def test_one_particle_none_seen_and_no_log_transition():
 
 
 @pytest.mark.parametrize(
+    "move", [mpfjax.GaussianRegeneration(), lambda key, mixture, now: mixture], ids=["G", "own"]
+)
+def test_initial_moves_that_may_change_the_trajectory_are_refused(move):
+    filter = mpfjax.particle_filter(Walled(), 6).replace(initial_moves=[move])
+    with pytest.raises(ValueError, match="cannot keep a trajectory"):
+        conditional_filter(jax.random.key(0), filter, ONES, np.zeros(4, np.float32))
+
+
+@pytest.mark.parametrize(
     ("trajectory", "index"),
     [
         ((0.5, 0.6, 0.4, 0.8), 2),  # a step back
