@@ -249,7 +249,8 @@ def with_alarm(filter: Filter, num_particles: Count = 4096) -> Filter:
 
     At each step the increment is compared with the evidence for a state that restarts from the
     prior. It is estimated from `num_particles` draws of x_0, the same at each step, which take as
-    long as so many particles. Use it if a lost target must be noticed.
+    long as so many particles. After `with_initialisation` the alarm begins at step L + 1. Use it if
+    a lost target must be noticed.
     """
     if _restarts(filter):
         return _with_restart(filter, num_particles=num_particles)

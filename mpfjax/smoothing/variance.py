@@ -56,6 +56,10 @@ class _KeepEveIndices(AbstractMove):
                     which = f"{chosen!r}, not {independent!r}"
                     raise ValueError(f"filter: {option} of {name} is {which}")
 
+    def around(self, reference: Any) -> AbstractMove:
+        """Raise a `ValueError`: in conditional SMC one particle is not drawn."""
+        raise ValueError("filter: with_eve_indices cannot keep a trajectory, which is not drawn")
+
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:

@@ -151,18 +151,6 @@ def test_an_entry_that_is_missing_is_left_out_and_a_step_without_any_is_predicte
     assert_equals(run, switching_filter(regimes_alike, mpfjax.Series.skipping(gaps)))
 
 
-def test_inputs_reach_the_dynamics():
-    """Their own path is taken off what is observed, and put back on what is found."""
-    pushes = jnp.array([[0.5, 0.0], [0.0, -1.0], [0.3, 0.2], [0.0, 0.0]])
-    run = mpfjax.run_filter(KEY, ONE, SERIES, lambda m: m.mean(), inputs=pushes)
-    path, place = [], np.zeros(2)
-    for push in np.asarray(pushes):
-        place = np.asarray(LINEAR.A) @ place + push
-        path.append(place)
-    path = np.array(path, np.float32)
-    assert_equals(run, kalman_filter(LINEAR, SERIES - path @ np.asarray(LINEAR.H).T), path)
-
-
 @pytest.mark.exactness
 def test_moments_of_a_mixture_are_those_of_its_gaussians():
     mixture = final_of("a component for each regime")

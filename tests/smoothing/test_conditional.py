@@ -135,9 +135,10 @@ def test_one_particle_none_seen_and_no_log_transition():
     "move", [mpfjax.GaussianRegeneration(), lambda key, mixture, now: mixture], ids=["G", "own"]
 )
 def test_initial_moves_that_may_change_the_trajectory_are_refused(move):
-    filter = mpfjax.particle_filter(Walled(), 6).replace(initial_moves=[move])
-    with pytest.raises(ValueError, match="cannot keep a trajectory"):
-        conditional_filter(jax.random.key(0), filter, ONES, np.zeros(4, np.float32))
+    plain = mpfjax.particle_filter(Walled(), 6, scheme="multinomial")
+    for filter in (plain.replace(initial_moves=[move]), mpfjax.with_eve_indices(plain)):
+        with pytest.raises(ValueError, match="cannot keep a trajectory"):
+            conditional_filter(jax.random.key(0), filter, ONES, np.zeros(4, np.float32))
 
 
 @pytest.mark.parametrize(

@@ -18,40 +18,6 @@ SEEN = jnp.array([[0.8], [0.1], [-0.4]])
 NUM_STEPS = 3
 
 
-@pytest.mark.weekly
-def test_moments_are_the_kalman_filters_and_components_keep_their_masses():
-    filter = mpfjax.mixture_particle_filter(LINEAR, 100, 3)
-
-    @jax.jit
-    @jax.vmap
-    def one(key):
-        key_run, key = jax.random.split(key)
-        run = mpfjax.run_filter(key_run, filter, SEEN, lambda mixture: None)
-        ahead = forecast(key, filter, run.final, NUM_STEPS)
-
-        def moments(mixture, observations):
-            x, y = mixture.particles[:, 0], observations[:, 0]
-            return [mixture.expectation(value) for value in (x, x**2, y, y**2)]
-
-        found = jax.vmap(moments)(ahead.mixtures, ahead.observations)
-        masses = jax.vmap(lambda mixture: mixture.log_mass)(ahead.mixtures)
-        return run.log_marginal_likelihood, jnp.stack(found, axis=1), masses
-
-    filter_keys = jax.random.split(jax.random.key(0), 1000)
-    log_evidence, found, log_masses = map(np.asarray, one(filter_keys))
-    np.testing.assert_allclose(log_masses, 0.0, atol=1e-5)
-    exact = kalman_filter(LINEAR, SEEN)
-    ratios = np.exp(log_evidence - float(exact.log_marginal_likelihood))
-    mean, variance = float(exact.means[-1, 0]), float(exact.covariances[-1, 0, 0])
-    expected = []
-    for _ in range(NUM_STEPS):
-        mean, variance = 0.9 * mean, 0.81 * variance + 0.3
-        expected.append([mean, variance + mean**2, mean, variance + 0.4 + mean**2])
-    weighed = ratios[:, None, None] * (found - np.array(expected))
-    z = weighed.mean(0) / (weighed.std(0) / np.sqrt(len(weighed)))
-    assert np.abs(z).max() < 4, z
-
-
 class ObservedDrift(DriftOfOne):
     """With draws of its observations."""
 

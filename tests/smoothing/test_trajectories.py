@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.exact import kalman_smoother
 from mpfjax.smoothing import backward, sample_trajectories, smoothed_sums, trace_ancestors
 
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
@@ -89,12 +88,6 @@ class NoTransition(mpfjax.AbstractStateSpaceModel):
         return -((observation - states) ** 2)
 
 
-OBJECTS = mpfjax.MultiObjectModel(
-    mpfjax.LinearGaussianModel(A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.0], P0=[[1.0]]), 2
-)
-SEEN = jnp.array([[[0.8], [-0.5]], [[1.3], [-0.2]], [[0.9], [0.3]]])
-
-
 @pytest.mark.exactness
 def test_what_follows_ancestors_refuses_particles_without_one_parent():
     filter, seen = mpfjax.gaussian_particle_filter(QUADRATIC, 50), jnp.full(3, 1.5)
@@ -113,17 +106,6 @@ def test_what_follows_ancestors_refuses_particles_without_one_parent():
         smoothed_sums(key, filter, seen, total, method="mcmc")
     with pytest.raises(ValueError, match=r"leaves no particle one parent.* with_eve"):
         mpfjax.with_eve_indices(filter)
-
-
-@pytest.mark.exactness
-def test_objects_that_come_from_particles_of_their_own_are_smoothed_right():
-    """Backward sampling by all weights, against each object's Kalman smoother."""
-    filter = mpfjax.independent_particle_filters(OBJECTS, 500)
-    run = mpfjax.run_filter(jax.random.key(0), filter, SEEN)
-    drawn = sample_trajectories(jax.random.key(1), filter, run, 2000)
-    for j in range(2):
-        exact = kalman_smoother(OBJECTS.object_model, SEEN[:, j]).means[:, 0]
-        np.testing.assert_allclose(drawn[:, :, j, 0].mean(axis=0), exact, atol=0.15)
 
 
 class Bounded(NoTransition):

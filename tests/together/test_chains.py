@@ -13,17 +13,14 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.exact import grid_filter, kalman_filter
-from tests.marking import exactness, quick_of, weekly
+from mpfjax.exact import grid_filter
+from tests.marking import quick_of
 from tests.registry import CHAINS, NUM_PARTICLES, QUICK_CHAINS
 from tests.unbiased import assert_unbiased
 from tests.user_models import (
     BLINDED,
     BROKEN,
-    DRIFT_AS_LINEAR_GAUSSIAN,
     EXPLODING,
-    Drift,
-    DriftOfOne,
     TrickyQuadraticModel,
     nothing_traced,
 )
@@ -31,11 +28,7 @@ from tests.user_models import (
 NUM_RUNS = 4000
 OBSERVATIONS = jnp.array([1.5, 1.0, 0.4, 0.9])
 GRID = jnp.linspace(-5.0, 5.0, 1001)
-MODELS = {
-    "quadratic": TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0),
-    "drift": Drift(),
-    "drift of one": mpfjax.per_particle(DriftOfOne()),
-}
+MODEL = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
 
 over_chains = pytest.mark.parametrize("chain", quick_of(QUICK_CHAINS, QUICK_CHAINS[:2]))
 
@@ -49,20 +42,15 @@ class Truth(NamedTuple):
 
 
 @cache
-def truth(model):
-    if model == "quadratic":
-        run = grid_filter(MODELS[model], OBSERVATIONS, GRID)
-        first, second = run.means[:, None], (run.variances + run.means**2)[:, None]
-    else:
-        run = kalman_filter(DRIFT_AS_LINEAR_GAUSSIAN, OBSERVATIONS[:, None])
-        first = run.means
-        second = jnp.diagonal(run.covariances, axis1=1, axis2=2) + first**2
+def truth():
+    run = grid_filter(MODEL, OBSERVATIONS, GRID)
+    first, second = run.means[:, None], (run.variances + run.means**2)[:, None]
     return Truth(*map(np.asarray, (jnp.cumsum(run.log_likelihood_increments), first, second)))
 
 
-def joint_truth(chain, model):
+def joint_truth(chain):
     """The same for all objects of the chain, which are independent and see the same."""
-    one, copies = truth(model), getattr(chain_filter(chain, model).model, "num_objects", 1)
+    one, copies = truth(), getattr(chain_filter(chain).model, "num_objects", 1)
     first, second = (np.tile(moment, copies) for moment in (one.first, one.second))
     return Truth(copies * one.log_evidence, first, second)
 
@@ -73,48 +61,32 @@ def moments(mixture):
 
 
 @cache
-def chain_filter(chain, model):
-    return CHAINS[chain](MODELS[model])
+def chain_filter(chain):
+    return CHAINS[chain](MODEL)
 
 
-# What the state is makes no difference to regrouping: a second model for a few, and more slots than
-# particles for what deals with them, each in its own way.
-IN_SLOTS = ("pf stratified", "pf multinomial", "metropolis", "mpf", "random labels, stratified")
-OTHERWISE = [
-    ("guided pf", "drift of one", None),
-    *((chain, "drift", None) for chain in ("guided mpf", "partitioned in clusters", "mpf rqmc")),
-    *((chain, "quadratic", 120) for chain in IN_SLOTS),
-]
-# The parts of all other chains have an exact answer in a file of their own.
+# The parts of all other chains have an exact answer in a file of their own; other models, and more
+# slots than particles, are in the matrix.
 COVERING = ("pf rqmc", "mpf", "dps")
 APPROXIMATE = {"dps prior", "exclusion", "gaussian mixture", "gaussian mixture rqmc"}
-EXACT = [
-    *quick_of(
-        [(chain, "quadratic", None) for chain in CHAINS if chain not in APPROXIMATE],
-        [(chain, "quadratic", None) for chain in COVERING],
-        one_in=8,
-    ),
-    *exactness(OTHERWISE[::4]),
-    *weekly([each for each in OTHERWISE if each not in OTHERWISE[::4]]),
-]
+EXACT = quick_of([chain for chain in CHAINS if chain not in APPROXIMATE], COVERING, one_in=8)
 
 
 @cache
-def runs(chain, model="quadratic", slots=None):
+def runs(chain):
     keys = jax.random.split(jax.random.key(3), NUM_RUNS)
-    filter = chain_filter(chain, model)
-    run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, moments, num_slots=slots)
+    run = mpfjax.monte_carlo(keys, chain_filter(chain), OBSERVATIONS, moments)
     return jax.tree.map(np.asarray, run)
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize(("chain", "model", "slots"), EXACT)
-def test_evidence_and_moments_are_unbiased(chain, model, slots):
+@pytest.mark.parametrize("chain", EXACT)
+def test_evidence_and_moments_are_unbiased(chain):
     """E[Ẑ/Z] = 1, and E[Ẑ/Z φ̂] = E[φ | y], at every step, within 4 standard errors.
 
     A particle filter's estimate of E[φ | y] is biased, but times its evidence it is not.
     """
-    run, exact = runs(chain, model, slots), joint_truth(chain, model)
+    run, exact = runs(chain), joint_truth(chain)
     log_evidence = np.cumsum(run.log_likelihood_increments, axis=1)
     ratios = np.exp(log_evidence - exact.log_evidence)
     first, second, _ = run.collected
@@ -122,12 +94,11 @@ def test_evidence_and_moments_are_unbiased(chain, model, slots):
     assert_unbiased(ratios[..., None] * first, exact.first)
     assert_unbiased(ratios[..., None] * second, exact.second)
     np.testing.assert_allclose(run.log_marginal_likelihood, log_evidence[:, -1], rtol=1e-4)
-    final, filter = run.final, chain_filter(chain, model)
+    final, filter = run.final, chain_filter(chain)
     np.testing.assert_allclose(np.exp(final.log_weights).sum(axis=1), 1.0, rtol=1e-5)
     assert (final.component_indicators >= 0).all()
     assert (final.component_indicators < filter.num_components).all()
     filled = final.log_weights > -np.inf
-    assert not filled[:, NUM_PARTICLES:].any()
     ancestors = final.ancestor_indices[filled]
     if all(move.keeps_parents for move in filter.moves):
         assert ((ancestors >= 0) & (ancestors < NUM_PARTICLES)).all()
@@ -136,7 +107,7 @@ def test_evidence_and_moments_are_unbiased(chain, model, slots):
 
 
 def test_what_is_approximate_is_declared():
-    declared = {chain for chain in CHAINS if chain_filter(chain, "quadratic").approximate}
+    declared = {chain for chain in CHAINS if chain_filter(chain).approximate}
     assert declared == APPROXIMATE
 
 
@@ -146,7 +117,7 @@ class TestOnline:
 
     @pytest.mark.exactness
     def test_step_by_step_equals_the_scan_and_a_loop_equals_vmap(self, chain):
-        run, filter = runs(chain), chain_filter(chain, "quadratic")
+        run, filter = runs(chain), chain_filter(chain)
         k = 6  # in which no particle lies within rounding of the edge between two offspring
         key_initial, key_steps = jax.random.split(jax.random.split(jax.random.key(3), NUM_RUNS)[k])
         mixture = filter.init(key_initial, OBSERVATIONS[0])
@@ -161,7 +132,7 @@ class TestOnline:
             np.testing.assert_array_equal(getattr(mixture, name), getattr(run.final, name)[k])
 
     def test_a_step_of_zero_likelihood_is_flagged_and_the_filter_goes_on(self, chain):
-        filter = chain_filter(chain, "quadratic")
+        filter = chain_filter(chain)
         mixture = started(chain)
         blinded, info = filter.step(jax.random.key(6), mixture, observed(BLINDED))
         assert float(info.log_likelihood_increment) == -np.inf
@@ -203,7 +174,7 @@ class TestOnline:
             np.testing.assert_array_equal(*labels)
 
     def test_a_number_that_is_not_finite_is_an_error(self, chain):
-        filter = chain_filter(chain, "quadratic")
+        filter = chain_filter(chain)
         density = "model: a density was NaN or infinite"
         for value, words in ((jnp.nan, "observation"), (BROKEN, density), (EXPLODING, density)):
             with pytest.raises((ValueError, RuntimeError), match=words):
@@ -215,7 +186,7 @@ class TestOnline:
         other = CHAINS[chain](TrickyQuadraticModel(0.4, 0.2, -2.0, 2.0))
         with nothing_traced():
             for t, observation in enumerate((2.0, 1.0, 0.0, 0.0, 0.0, 3.0, BLINDED, 1.0)):
-                filter = other if t % 3 == 2 else chain_filter(chain, "quadratic")
+                filter = other if t % 3 == 2 else chain_filter(chain)
                 mixture, _ = filter.step(jax.random.key(t), mixture, observed(observation))
 
 
@@ -227,14 +198,14 @@ def observed(value):
 @cache
 def started(chain):
     """The chain's mixture after one step."""
-    filter = chain_filter(chain, "quadratic")
+    filter = chain_filter(chain)
     mixture = filter.init(jax.random.key(4))
     return filter.step(jax.random.key(5), mixture, OBSERVATIONS[0])[0]
 
 
 @pytest.mark.exactness
 def test_a_missing_observation_moves_the_particles_and_leaves_the_masses():
-    filter, mixture = chain_filter("mpf", "quadratic"), started("mpf")
+    filter, mixture = chain_filter("mpf"), started("mpf")
     predicted, info = filter.predict(jax.random.key(6), mixture)
     assert float(info.log_likelihood_increment) == 0.0
     assert not np.array_equal(predicted.particles, mixture.particles)

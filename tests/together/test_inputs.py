@@ -188,21 +188,6 @@ def test_an_input_of_a_step_that_is_nan_or_not_there_is_an_error():
 
 
 @pytest.mark.exactness
-def test_a_missing_observation_does_not_miss_its_input():
-    found = run(observations=OBSERVATIONS.at[-1].set(jnp.nan), missing="skip", collect=None)
-    before = jax.tree.map(lambda leaf: leaf[-2], found.collected)
-    last = jax.tree.map(lambda leaf: leaf[-1], INPUTS)
-    key = jax.random.split(jax.random.split(KEY)[1], LENGTH)[-1]
-    predicted, _ = FILTER.predict(key, before, inputs=last)
-    np.testing.assert_allclose(predicted.mean(), found.final.mean(), rtol=1e-4)
-    ahead = jax.tree.map(lambda leaf: leaf[None], last)
-    forecast = mpfjax.forecast(key, FILTER, before, 1, inputs=ahead)
-    kept = np.exp(-RATE * last["dt"])
-    expected = kept * before.mean() + (1 - kept) * GAIN * last["u"]
-    np.testing.assert_allclose(forecast.mixtures.particles.mean(), expected, atol=0.3)
-
-
-@pytest.mark.exactness
 def test_monte_carlo_islands_and_studies_hand_them_on(tmp_path):
     expected, series = run().log_marginal_likelihood, mpfjax.Series(OBSERVATIONS, INPUTS)
     runs = mpfjax.monte_carlo(KEY[None], FILTER, series, nothing)

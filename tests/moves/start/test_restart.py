@@ -16,7 +16,6 @@ from mpfjax.moves.start.restart import Restart
 from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_sums
 from tests.marking import weekly
 from tests.moves.start.test_sampler import PLANE, WithKeys
-from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, truth
 from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import Batched, ScalarLinear
 
@@ -84,30 +83,6 @@ def test_a_checkpoint_within_the_window_goes_on_to_the_bit(tmp_path):
     loaded = mpfjax.load_checkpoint(tmp_path / "first.npz", like=mixture)
     both = [START.step(KEY, each, SEEN[1])[0] for each in (mixture, loaded)]
     chex.assert_trees_all_equal(*both)
-
-
-@pytest.mark.exactness
-def test_inputs_of_each_step_are_those_of_the_window():
-    """As a field of the model, and as matrices of each step."""
-    filter = mpfjax.with_initialisation(mpfjax.particle_filter(Driven(), 100), LENGTH)
-    series = mpfjax.Series(OBSERVATIONS, INPUTS)
-    log_z, filtered, _ = truth()
-    runs = mpfjax.monte_carlo(jax.random.split(KEY, 300), filter, series, mean)
-    ratios = ratios_to(log_z, runs)
-    assert_unbiased(ratios, loosest=0.03)
-    last = np.asarray(runs.collected)[:, -1]
-    assert_unbiased(ratios * last, filtered[-1], loosest=0.05)
-
-
-@pytest.mark.exactness
-def test_matrices_of_each_step_are_those_of_the_window():
-    one = np.eye(1)
-    model = mpfjax.LinearGaussianModel(one, 0.1 * one, one, 0.1 * one, np.zeros(1), 4 * one)
-    matrices = {"A": np.array([0.5, 1.5, 0.7, 1.2], np.float32)[:, None, None]}
-    series = mpfjax.Series(np.array([[0.6], [1.0], [0.3], [0.8]], np.float32), matrices)
-    filter = mpfjax.with_initialisation(mpfjax.particle_filter(model, 100), LENGTH)
-    runs = mpfjax.monte_carlo(jax.random.split(KEY, 300), filter, series, mean)
-    assert_unbiased(ratios_to(kalman_filter(model, series), runs), loosest=0.05)
 
 
 def log_evidence_with_a_restart(seen, carried, model=PLANE):
@@ -227,12 +202,6 @@ def test_an_alarm_begins_where_the_start_ends():
 
 
 def test_what_cannot_begin_so_is_refused():
-    with pytest.raises(ValueError, match="need every slot"):
-        mpfjax.monte_carlo(jax.random.split(KEY, 2), START, SEEN, mean, num_slots=120)
-    with pytest.raises(ValueError, match="first observations already"):
-        mpfjax.with_initialisation(START)
-    with pytest.raises(ValueError, match="more observations than y_1"):
-        mpfjax.with_initial_selection(START)
     with pytest.raises(ValueError, match="defines no log_initial"):
         mpfjax.with_initialisation(mpfjax.particle_filter(Batched(), 50))
     with pytest.raises(ValueError, match="num_particles: 40, of which 2 may be all of the slots"):
