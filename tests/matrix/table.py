@@ -128,7 +128,7 @@ RULES = (
     Rule("cannot keep a trajectory|cannot be smoothed|independent|one Propagate|approximate",
          "conditional SMC and particle Gibbs support only `Resample`, `Propagate` and regrouping",
          filters=GAUSSIAN | OF_OBJECTS | METROPOLIS | BEGUN
-         | these("point sets", "two draws", "families", "PropagateNested", "Bernoulli",
+         | these("point sets", "two draws", "families", "alarm", "PropagateNested", "Bernoulli",
                  "PropagateRegimes", "own function", "initially own function", "Prune",
                  "Exclusion"),
          questions=OF_PATHS),

@@ -79,10 +79,6 @@ class WatchStart(AbstractMove):
         """The alarm before any observation."""
         return {ALARM: Alarm(jnp.zeros(()), self.num_particles)}
 
-    def around(self, reference: object) -> "WatchStart":
-        """The move itself, which changes nothing."""
-        return self
-
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """The mixture itself."""
         return mixture
