@@ -98,7 +98,7 @@ class RecentSteps(Memory):
             is_impossible=_push(self.is_impossible, log_increment == -jnp.inf, length),
         )
 
-    def reported(
+    def with_report(
         self,
         mixture: ParticleMixture,
         now: Step,
@@ -218,7 +218,7 @@ class Restart(AbstractWrapper):
                 is_due, partial(self._renew, key, mixture, now, is_due), lambda: mixture
             )
         recent, increment = mixture.memory[RECENT], _increment(mixture)
-        recent = recent.reported(mixture, now, log_evidence, increment)
+        recent = recent.with_report(mixture, now, log_evidence, increment)
         return _with_recent(mixture, recent, jnp.where(mixture.t < recent.start, 0.0, increment))
 
     def _renew(
@@ -257,16 +257,16 @@ class Restart(AbstractWrapper):
         slot, num_old = jnp.arange(n, dtype=jnp.int32), n - number
         is_new, place = slot >= num_old, jnp.clip((slot - num_old) * n // number, 0, n - 1)
         new = jax.tree.map(lambda leaf: take(leaf, place), sample.states)
-        joined = old.at(systematic_sample(key_join, old.log_weights, num_old))
+        both = old.at(systematic_sample(key_join, old.log_weights, num_old))
         log_weights = jnp.where(is_new, log_new - jnp.log(number), log_old - jnp.log(num_old))
-        joined = joined.with_resampled(joined.active).replace(
-            particles=select_rows(is_new, new, joined.particles),
+        both = both.with_resampled(both.active).replace(
+            particles=select_rows(is_new, new, both.particles),
             log_weights=log_weights.astype(old.log_weights.dtype),
-            component_indicators=jnp.where(is_new, 0, joined.component_indicators),
-            ancestor_indices=jnp.where(is_new, BEGAN_ANEW, joined.ancestor_indices),
+            component_indicators=jnp.where(is_new, 0, both.component_indicators),
+            ancestor_indices=jnp.where(is_new, BEGAN_ANEW, both.ancestor_indices),
             log_scale=log_scale,
         )
-        moved, log_growth = joined.normalised(old)
+        moved, log_growth = both.normalised(old)
         recent = dataclasses.replace(
             recent,
             log_increments=jnp.where(is_start, sample.log_increments, old_increments),
