@@ -158,8 +158,12 @@ def _first_paths(key: Key[Array, ""], model: Any, num_particles: int, num_steps:
 def _observe(
     key: Key[Array, ""], model: Any, window: Window, paths: _Paths, s: Int[Array, ""], n: int
 ) -> tuple[_Paths, Float[Array, ""], Bool[Array, ""]]:
-    """The paths given the window's step s too, its evidence, and whether the powers ran out."""
-    paths, number = _advance(model, window, s, paths), paths.noise.shape[0]
+    """The paths given the window's step s too, its evidence, and whether the powers ran out.
+
+    At first they are only advanced, by the loop that moves them later, so that a model is compiled
+    once.
+    """
+    number = paths.noise.shape[0]
     num_moves = NOISE_MOVES + jnp.maximum(PATH_STEPS // (s + 1), 1)
     num_words = 4 + 2 * flatten_states(paths.initial).shape[1] + paths.noise.shape[2]
 
@@ -172,34 +176,41 @@ def _observe(
         return jax.tree.map(lambda leaf: take(leaf, ancestors), paths)
 
     def temper(carry: tuple) -> tuple:
-        key, paths, power, log_increment, count = carry
-        key, key_resample, key_moves = split(key, 3)
-        rest = 1 - power
-        growth = jnp.where(count == MOST_POWERS, rest, _growth(paths.log_likelihood[n:], rest))
+        old_key, old, power, log_increment, count = carry
+        key, key_resample, key_moves = split(old_key, 3)
+        is_first, rest = count == 0, 1 - power
+        growth = jnp.where(count == MOST_POWERS, rest, _growth(old.log_likelihood[n:], rest))
         is_last = power + growth > 1 - 1e-6
         growth, after = jnp.where(is_last, rest, growth), jnp.where(is_last, 1.0, power + growth)
-        log_weights = growth * paths.log_likelihood
-        log_increment += log_sum_exp(log_weights[:n]) - np.log(n)
-        paths = resample(key_resample, paths, log_weights)
+        log_weights = growth * old.log_likelihood
+        log_mass = log_sum_exp(log_weights[:n]) - np.log(n)
+        paths = resample(key_resample, old, log_weights)
         pilot = flatten_states(paths.initial)[n:]
+        key, paths, after, log_mass = jax.tree.map(
+            partial(jnp.where, is_first),
+            (old_key, old, jnp.zeros_like(after), jnp.zeros_like(log_mass)),
+            (key, paths, after, log_mass),
+        )
 
         def move(i: Int[Array, ""], paths: _Paths) -> _Paths:
             words = bits(jax.random.fold_in(key_moves, i), (num_words, number))
             is_of_noise = i < NOISE_MOVES
             new = _propose(words[1:], model, paths, s, pilot, is_of_noise)
+            new = jax.tree.map(partial(jnp.where, is_first), paths, new)
             first = jnp.where(is_of_noise, s, 0)
             new = jax.lax.fori_loop(first, s + 1, partial(_advance, model, window), new)
             log_ratio = _log_target(model, new, after) - _log_target(model, paths, after)
             is_accepted = jnp.log(uniform_of(words[0], log_ratio.dtype)) < log_ratio
-            return select_rows(is_accepted, new, paths)
+            return select_rows(is_accepted | is_first, new, paths)
 
         # Where y_t is no surprise at all, the draws are as good as new ones.
         is_moved = (power > 0) | (after < 1)
-        paths = jax.lax.fori_loop(0, jnp.where(is_moved, num_moves, 0), move, paths)
-        return key, paths, after, log_increment, count + 1
+        count_moves = jnp.where(is_first, 1, jnp.where(is_moved, num_moves, 0))
+        paths = jax.lax.fori_loop(0, count_moves, move, paths)
+        return key, paths, after, log_increment + log_mass, count + 1
 
     zero = jnp.zeros((), default_float())
-    first = key, paths, zero, zero, jnp.ones((), jnp.int32)
+    first = key, paths, zero, zero, jnp.zeros((), jnp.int32)
     _, paths, _, log_increment, count = jax.lax.while_loop(
         lambda carry: carry[2] < 1, temper, first
     )
