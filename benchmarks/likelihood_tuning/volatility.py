@@ -49,6 +49,7 @@ METHODS: dict[str, tuple[Any, Any, bool, int, str]] = {
     "pooled": ("stop", "filter", True, 8, "log of mean Ẑ, jackknife, K = 8"),
     "fisher": ("none", "fisher", True, 8, "the same, Fisher's identity"),
 }
+TITLES = {name: method[-1] for name, method in METHODS.items()} | {"exact": "exact maximum"}
 NUM_PARTICLES, BATCH, NUM_STEPS, CURVATURE_SEEDS = 100, 32, 100, 64
 
 
@@ -230,11 +231,12 @@ def learned(
         learned_from(num_series, method, steps, seed + number)
         for method, number in harness.grid("fit", methods, range(data_sets))
     ]
+    entries += [exact_from(num_series, seed + number) for number in range(data_sets)]
     rows = []
-    for method in methods:
+    for method in [*methods, "exact"]:
         of_method = [entry for entry in entries if entry["method"] == method]
         means = {name: np.mean([e[name] for e in of_method]) for name in [*TRUTH, "seconds"]}
-        rows.append({"method": METHODS[method][-1]} | means)
+        rows.append({"method": TITLES[method]} | means)
     columns = {"method": "{method}"} | ERRORS | {"CPU s": "{seconds:.0f}"}
     return "Mean errors of learned parameters", harness.table(columns, rows + PUBLISHED), entries
 
@@ -247,8 +249,9 @@ def coverage(
         learned_from(num_series, method, steps, seed + number, CURVATURE_SEEDS)
         for method, number in harness.grid("fit", methods, range(data_sets))
     ]
+    entries += [exact_from(num_series, seed + number) for number in range(data_sets)]
     rows = []
-    for method in methods:
+    for method in [*methods, "exact"]:
         of_method = [e for e in entries if e["method"] == method and e["standard_errors"]]
         shares = {
             name: np.mean(
@@ -256,7 +259,7 @@ def coverage(
             )
             for name in TRUTH
         }
-        rows.append({"method": METHODS[method][-1], "number": len(of_method)} | shares)
+        rows.append({"method": TITLES[method], "number": len(of_method)} | shares)
     columns = {"method": "{method}", "data sets": "{number}"}
     columns |= {name: f"{{{name}:.2f}}" for name in TRUTH}
     title = f"Coverage of 90% intervals, data sets of {num_series} series"
@@ -285,4 +288,19 @@ def learned_from(
     return {"method": method, "seed": seed, "seconds": process_time() - began} | errors | {
         "effective_seeds": np.asarray(run.effective_seeds).mean(), "start": start,
         "standard_errors": run.standard_errors,
+    }  # fmt: skip
+
+
+def exact_from(num_series: int, seed: int) -> dict[str, Any]:
+    """The exact maximum for the same data, with the exact standard errors."""
+    began = process_time()
+    point, hessian = maximum(jnp.asarray(simulate(num_series, seed)))
+    slopes = jax.grad(lambda reals: sum(constrained(reals).values()))(point)
+    deviations = np.sqrt(np.diag(np.linalg.inv(-hessian)))
+    values = constrained(point)
+    errors = {name: abs(float(values[name]) - true) for name, true in TRUTH.items()}
+    return {"method": "exact", "seed": seed, "seconds": process_time() - began} | errors | {
+        "standard_errors": {
+            name: float(slopes[name]) * d for name, d in zip(TRUTH, deviations, strict=True)
+        },
     }  # fmt: skip

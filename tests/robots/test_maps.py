@@ -95,9 +95,9 @@ def test_numbers_of_a_file_may_be_text(tmp_path):
 
 
 def test_a_coloured_wall_is_the_mean_of_its_channels(tmp_path):
-    """Green has the grey of an unknown cell for an eye, and a third of white for ROS."""
-    pixels = np.array([[[0, 255, 0], [255, 255, 255]]], np.uint8)
-    assert read_states(written(tmp_path, pixels)) == [["#", "."]]
+    """For ROS green and red are a third of white, and yellow two thirds, whatever an eye says."""
+    pixels = np.array([[[0, 255, 0], [255, 0, 0], [255, 255, 0], [255, 255, 255]]], np.uint8)
+    assert read_states(written(tmp_path, pixels)) == [["#", "#", "?", "."]]
 
 
 def test_unknown_grey_that_becomes_free_is_a_warning(tmp_path):
