@@ -295,12 +295,12 @@ def exact_from(num_series: int, seed: int) -> dict[str, Any]:
     """The exact maximum for the same data, with the exact standard errors."""
     began = process_time()
     point, hessian = maximum(jnp.asarray(simulate(num_series, seed)))
+    variances, values = np.diag(np.linalg.inv(-hessian)), constrained(point)
     slopes = jax.grad(lambda reals: sum(constrained(reals).values()))(point)
-    deviations = np.sqrt(np.diag(np.linalg.inv(-hessian)))
-    values = constrained(point)
     errors = {name: abs(float(values[name]) - true) for name, true in TRUTH.items()}
     return {"method": "exact", "seed": seed, "seconds": process_time() - began} | errors | {
         "standard_errors": {
-            name: float(slopes[name]) * d for name, d in zip(TRUTH, deviations, strict=True)
-        },
+            name: float(slopes[name]) * variance**0.5
+            for name, variance in zip(TRUTH, variances.tolist(), strict=True)
+        } if (variances > 0).all() else None,
     }  # fmt: skip
