@@ -19,7 +19,7 @@ class Pairs(NamedTuple):
 
     @classmethod
     def of(cls, values: Float[np.ndarray, "m d"], possible: Bool[np.ndarray, "m d"]) -> "Pairs":
-        """Those of a matrix that are possible."""
+        """The pairs of a matrix where `possible` is true."""
         rows, columns = np.nonzero(possible)
         return cls(rows, columns, values[rows, columns], (values.shape[0], values.shape[1]))
 
