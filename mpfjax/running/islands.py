@@ -22,6 +22,7 @@ from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.islands import (
     DEVICE_AXIS,
     ISLAND_AXIS,
+    island_index,
     num_islands,
     over_islands,
 )
