@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import mpfjax
+import mpfjax.running.run
 from mpfjax.exact import grid_filter
 from mpfjax.operations import compiling
 from mpfjax.operations.compiling import cpu_options, in_little_memory
