@@ -385,16 +385,3 @@ def test_still_objects_before_a_shaking_camera_are_shown_and_keep_their_names(sh
             found = boxes, np.array([1, 1, 0.6, 0.6])
             state, tracks = EIGHT.step(None, state, None, found, told)
             assert tracks.shown.sum() == tracks.identities.max() == 4
-
-
-def test_an_object_that_turns_around_alone_is_followed():
-    """Its detection is its own although it was expected elsewhere."""
-    tracker = ObjectTracker(M, frames_per_second=10)
-    state, x, speed = tracker.init(), 300.0, 5.0
-    for t in range(16):
-        speed -= 22.0 * (t == 15)
-        x += speed
-        row = np.array([[x, 100, 60, 40]])
-        state, tracks = tracker.step(None, state, None, row, frame_size=(375, 1242))
-    assert tracks.identities.tolist() == [1]
-    assert tracks.probabilities[0] > 0.85

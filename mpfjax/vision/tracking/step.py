@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 # Of a weak detection, of an object that is not confirmed, and of one of another class.
 _WEAK_COST, _DOUBT_COST, _CLASS_COST = 8.0, 2.0, 8.0
-_LONE_GAIN = 8.0  # of a pair of an object and a detection that have no other
 WEAK_ERROR = 1.35  # times the error of a strong detection
 _YIELDING = 0.01  # of the claim of an object that takes only what others leave
 _BIRTH_OVERLAP = 0.5  # with an object or a stronger detection: it is one more box of the same
@@ -267,9 +266,6 @@ def _match(kind: Kind, state: TrackerState, frame: _Frame) -> _Matches:
     distance = distance.at(frame.counts[distance.columns])
     costs = distance.values + np.where(frame.strong, 0.0, _WEAK_COST)[distance.columns]
     costs += np.where(state.lives.confirmed, 0.0, _DOUBT_COST)[distance.rows]
-    if kind.has_boxes:
-        distance, costs = distance.at(costs < _LONE_GAIN), costs[costs < _LONE_GAIN]
-        costs = costs - np.where(_are_lone(distance, state, frame), _LONE_GAIN, 0.0)
     distance, costs = distance.at(costs < 0), costs[costs < 0]
     claims = np.where(state.duplicates.doubtful, _YIELDING, 1.0)[distance.rows]
     cost = distance._replace(values=claims * costs)
@@ -282,16 +278,6 @@ def _match(kind: Kind, state: TrackerState, frame: _Frame) -> _Matches:
         gains[rows] = -0.5 * distance.values[chosen]
     strong = np.append(frame.strong, False)[columns]
     return _Matches(columns, matched, strong, probability, gains)
-
-
-def _are_lone(pairs: Pairs, state: TrackerState, frame: _Frame) -> Bool[np.ndarray, " p"]:
-    """Which pairs are of a confirmed object and a strong detection that have no other.
-
-    Where such an object was expected elsewhere it has accelerated, and its update must not be
-    weakened by doubt; unless its class, colours or vector speak against it.
-    """
-    is_sure = state.lives.confirmed[pairs.rows] & frame.strong[pairs.columns]
-    return is_sure & ~pairs.rivals & (frame.costs[pairs.rows, pairs.columns] <= 0)
 
 
 def _update(state: TrackerState, frame: _Frame, matches: _Matches) -> TrackerState:
