@@ -116,14 +116,17 @@ def averages(values: Float[Array, "seeds series"], pooled: bool) -> Float[Array,
 
     The bias of that logarithm is c / K + O(1 / K²) for K seeds. The jackknife (Quenouille 1956),
     K times the logarithm minus K - 1 times its mean over the sets that lack one seed, removes c.
+    A series of which one seed alone has any likelihood has no such sets: it is not corrected.
     """
     num_seeds = len(values)
     if not pooled or num_seeds == 1:
         return jnp.mean(values, axis=0)
-    omitted = jnp.eye(num_seeds, dtype=bool)[:, :, None]
+    has_sets = jnp.sum(values > -jnp.inf, axis=0) > 1
+    omitted = jnp.eye(num_seeds, dtype=bool)[:, :, None] & has_sets[None, None]
     others = logsumexp(jnp.where(omitted, -jnp.inf, values), axis=1) - jnp.log(num_seeds - 1.0)
     whole = logsumexp(values, axis=0) - jnp.log(float(num_seeds))
-    return whole + (num_seeds - 1) * (whole - jnp.mean(others, axis=0))
+    correction = (num_seeds - 1) * (whole - jnp.mean(others, axis=0))
+    return whole + jnp.where(has_sets, correction, 0.0)
 
 
 @eqx.filter_jit

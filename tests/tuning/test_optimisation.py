@@ -111,6 +111,12 @@ STILL = optax.sgd(0.0)
 class TestPooling:
     """Model parameters maximise Σ log mean Ẑ over seeds; a proposal's, the mean of log Ẑ."""
 
+    def test_a_series_with_one_possible_seed_is_not_corrected(self):
+        values = jnp.array([[0.5], [-jnp.inf], [-jnp.inf]])
+        assert averages(values, pooled=True)[0] == pytest.approx(0.5 - np.log(3))
+        slopes = jax.grad(lambda values: averages(values, pooled=True)[0])(values)
+        np.testing.assert_allclose(slopes[:, 0], [1, 0, 0])
+
     def test_the_objective_is_the_jackknife_of_the_log_of_the_mean(self):
         """3 log (1/3 Σ Ẑ) - 2 times its mean over pairs of seeds, and the gradient of that."""
         problem = pose_evidence(small(8), SEVERAL, NOISE, {"r": Positive()})
