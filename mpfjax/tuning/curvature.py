@@ -12,11 +12,15 @@ from mpfjax.checks import Count, checked, warn
 from mpfjax.filter import Filter
 from mpfjax.tuning.bijections import Unconstrained
 from mpfjax.tuning.evidence import Score, pose_evidence, warn_of_bias
-from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms, score_of_each
+from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms, scores
 
 _MOST_NUMBERS = 50
-# The range of the squared step, relative to 1 / I, that is near enough to one standard error.
-_NEAR = (0.4, 2.5)
+# Seeds whose Ẑ are averaged, as in `fit`.
+_BATCH = 10
+# Of a step, in standard errors, and the range of its square that is near enough. At one standard
+# error the noise is larger beside the difference, at two a parabola fits too few models.
+_DISTANCE = 1.5
+_NEAR = (0.4 * _DISTANCE**2, 2.5 * _DISTANCE**2)
 _MOST_ROUNDS = 10
 _FURTHEST_ROUND = 16.0
 # In units in the last place of a parameter: a shorter step is mostly rounding.
@@ -41,16 +45,17 @@ def standard_errors(
 
     They are the roots of the diagonal of J I⁻¹ Jᵀ (the delta method). I is the observed information
     in unconstrained coordinates, and J the Jacobian of the parameters. I is computed by central
-    differences of the mean score, over about one standard error to each side, with the same seeds
-    on both sides. A few tries determine that distance, starting from the size of the score, so the
-    parameters may have any units. The scores must be unbiased: build the filter with
+    differences of the score, with the same seeds on both sides, one and a half standard errors
+    away. The score is that of `fit`, with ten seeds at a time, since the mean score of single seeds
+    has a bias that makes the errors too small. A few tries determine the distance, starting from
+    the size of the score, so the parameters may have any units. Build the filter with
     `gradient="stop"`, or use `score="fisher"`; otherwise there is a warning. The computation takes
-    one gradient of `num_seeds` runs, and for each try two for each coordinate; usually two tries,
-    at most ten.
+    one gradient of `num_seeds` runs, rounded up to whole tens, and for each try two for each
+    coordinate; usually two tries, at most ten.
 
     The arguments are those of `fit`. Noise in I makes the errors too large rather than too small. A
     warning is issued if there are too few seeds: if the standard error of one of the errors is more
-    than an eighth of it, by the delta method from the contribution of each seed to I.
+    than an eighth of it, by the delta method from the contribution of every ten seeds to I.
 
     Returns None, with a warning, if I is not positive definite: away from a maximum, along a
     direction that the data do not determine, or with too few seeds. Raises `ValueError` as `fit`
@@ -58,14 +63,15 @@ def standard_errors(
     """
     problem = pose_evidence(filter, observations, parameters, transforms, score)
     warn_of_bias("standard_errors", problem)
-    batches = [jax.random.split(key, num_seeds)]
+    size = min(num_seeds, _BATCH)
+    batches = list(jax.random.split(key, (-(-num_seeds // size), size)))
     return errors_at([problem], problem.start(), batches, "num_seeds")
 
 
 def errors_at(
     problems: list[Problem], reals: Reals, batches: list[Key[Array, " seeds"]], of_seeds: str
 ) -> dict[str, np.ndarray] | None:
-    """The standard errors at a point, from scores with all batches of seeds.
+    """The standard errors at a point, from the score with each batch of seeds.
 
     `problems` are of different series, whose scores are added up. `of_seeds` is the argument that
     says how many seeds there are.
@@ -75,17 +81,18 @@ def errors_at(
     if point.size > _MOST_NUMBERS:
         raise ValueError(f"parameters: {point.size} numbers; differences do for {_MOST_NUMBERS}")
 
+    def score_of(keys: Key[Array, " seeds"], at: Reals) -> Float[np.ndarray, " d"]:
+        total = np.zeros(point.size)
+        for number, part in enumerate(problems):
+            gradient = scores(fold(keys, number) if number else keys, part, at, pooled=True)[1]
+            total += np.asarray(ravel_pytree(gradient)[0], float)
+        return total
+
     fold = jax.vmap(jax.random.fold_in, (0, None))
 
-    def score(flat: np.ndarray) -> Float[np.ndarray, "seeds d"]:
+    def score(flat: np.ndarray) -> Float[np.ndarray, "batches d"]:
         at = unravel(jnp.asarray(flat))
-        each = [
-            np.concatenate([
-                score_of_each(fold(keys, number) if number else keys, part, at) for keys in batches
-            ])
-            for number, part in enumerate(problems)
-        ]  # fmt: skip
-        return np.sum(each, axis=0, dtype=float)
+        return np.stack([score_of(keys, at) for keys in batches])
 
     # By number, how far a step may go.
     longest = np.concatenate([
@@ -112,20 +119,20 @@ def errors_at(
 
 def _informations(
     score: Callable[[np.ndarray], np.ndarray], centre: np.ndarray, longest: np.ndarray
-) -> Float[np.ndarray, "seeds d d"]:
-    """The observed information, as each seed has it; NaN where there is none."""
+) -> Float[np.ndarray, "batches d d"]:
+    """The observed information, as each batch of seeds has it; NaN where there is none."""
     # In any units, a score is about as large as one over a standard error, if only by the noise of
     # its seeds.
     sizes = np.sqrt(np.mean(score(centre) ** 2, axis=0))
     shortest = _FEWEST_PLACES * np.asarray(np.spacing(np.abs(centre)), float)
 
-    def column(axis: int) -> Float[np.ndarray, "seeds d"]:
-        """A column for every seed, by differences over about one standard error.
+    def column(axis: int) -> Float[np.ndarray, "batches d"]:
+        """A column for every batch of seeds, by differences over `_DISTANCE` standard errors.
 
         So far the likelihood tells the points apart, and the noise matters least.
         """
         size, least, most = sizes[axis], shortest[axis], longest[axis]
-        step = float(np.clip(1 / size if 0 < size < np.inf else 1.0, least, most))
+        step = float(np.clip(_DISTANCE / size if 0 < size < np.inf else 1.0, least, most))
         for _ in range(_MOST_ROUNDS):
             below, above = centre.copy(), centre.copy()
             below[axis] -= step
@@ -140,7 +147,7 @@ def _informations(
             elif _NEAR[0] <= loss <= _NEAR[1]:
                 break
             else:
-                factor = _FURTHEST_ROUND if loss == 0 else 1 / np.sqrt(loss)
+                factor = _FURTHEST_ROUND if loss == 0 else _DISTANCE / np.sqrt(loss)
                 following = step * np.clip(factor, 1 / _FURTHEST_ROUND, _FURTHEST_ROUND)
             following = float(np.clip(following, least, max(least, most)))
             if following == step:
@@ -167,15 +174,17 @@ def _inverse(information: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"] 
 
 
 def _warn_of_noise(
-    informations: Float[np.ndarray, "seeds d d"],
+    informations: Float[np.ndarray, "batches d d"],
     covariance: Float[np.ndarray, "d d"],
     of_seeds: str,
 ) -> None:
-    """Warn where errors are uncertain: by the delta method, from what each seed adds to them."""
-    num_seeds, scale = len(informations), np.diagonal(covariance)
-    of_each = np.einsum("ij,sjk,ki->si", covariance, informations, covariance) / scale
-    uncertain = of_each.std(axis=0, ddof=1).max() / 2 / num_seeds**0.5 if num_seeds > 1 else np.inf
+    """Warn where errors are uncertain: by the delta method, from what each batch adds to them."""
+    num_batches, scale = len(informations), np.diagonal(covariance)
+    uncertain, by = np.inf, ""
+    if num_batches > 1:
+        of_each = np.einsum("ij,bjk,ki->bi", covariance, informations, covariance) / scale
+        uncertain = of_each.std(axis=0, ddof=1).max() / 2 / num_batches**0.5
+        by = f" by {uncertain:.0%}"
     if uncertain > _MOST_UNCERTAIN:
-        by = f" by {uncertain:.0%}" if num_seeds > 1 else ""
-        what = f"{num_seeds} seeds leave them uncertain{by}; raise {of_seeds}"
+        what = f"the seeds leave them uncertain{by}; raise {of_seeds}"
         warn(f"standard_errors: {what}", UserWarning)

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.flatten_util import ravel_pytree
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Key, PyTree
 
@@ -142,15 +141,6 @@ def scores(
 
     gradient, values = jax.grad(average, has_aux=True)(reals)
     return values, gradient
-
-
-@eqx.filter_jit
-def score_of_each(
-    keys: Key[Array, " seeds"], problem: Problem, reals: Reals
-) -> Float[Array, "seeds d"]:
-    """The gradient of each seed's objective, as `ravel_pytree` lays the parameters out."""
-    gradient = jax.grad(problem.value, argnums=1)
-    return jax.vmap(lambda key: ravel_pytree(gradient(key, reals))[0])(keys)
 
 
 def pose(
