@@ -4,30 +4,23 @@
 
 Every figure is of a fresh process, which finds Python's bytecode in place, as installed packages
 have it, whatever PYTHONDONTWRITEBYTECODE says. "Cold" starts with an empty folder of compiled
-programs, "kept" runs the same once more with what the cold run left there. The first rows are of
-calls within a process, after the imports; a row for the imports stands beside them. The others are
-whole commands, from start to end. The commands track a rendered scene, of one frame for the seconds
-to the first, and 795 frames of PETS where --data holds them. CPU seconds count all threads, so they
-change little when the machine does other work; seconds of the clock stand beside them.
+programs, "kept" runs the same once more with what the cold run left there. The rows are of calls
+within a process, after the imports, of the imports, and of a whole command. CPU seconds count all
+threads, so they change little when the machine does other work; seconds of the clock stand beside
+them.
 
 --before DIR runs the same in another checkout of mpfjax, in turns with this one, for a table of
 before and after. Into --out DIR go the table as first_result.json and nothing else.
 """
 
 import json
-import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
-from PIL import Image
 
-from benchmarks.harness import ROOT, Count, Spent, command, in_process, settings_of, table
-from benchmarks.harness import data as write
-from benchmarks.scenes import football_scene
-from mpfjax.vision import write_tracks
+from benchmarks.harness import ROOT, Count, Spent, command, data, in_process, settings_of, table
 
 FIGURES = ("cold", "kept", "kept, clock", "kept, MB")
 Arguments = tuple[str, ...]  # of Python; a script may print the seconds of a part of it
@@ -51,7 +44,7 @@ import contextlib, importlib, pkgutil, mpfjax
 names = [found.name for found in pkgutil.walk_packages(mpfjax.__path__, "mpfjax.")
          if not found.name.endswith("__main__")]
 names += ["benchmarks.score_vs_particles", "matplotlib.pyplot", "matplotlib.backends.backend_pdf",
-          "scipy.optimize", "trackeval", "av", "PIL.Image"]
+          "scipy.optimize"]
 for name in names:
     with contextlib.suppress(ImportError):
         importlib.import_module(name)
@@ -64,7 +57,6 @@ def main(
     before: Path | None = None,
     rounds: Count = 1,
     only: str = "",
-    data: Path = Path("../shared/data"),
     out: Path = Path("results/first_result"),
 ) -> None:
     """Round after round of each job, in turns with the other checkout's; then the table.
@@ -78,8 +70,7 @@ def main(
     roots = {"now": ROOT} if before is None else {"before": before, "now": ROOT}
     results: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
-        scene = render(Path(folder) / "scene")
-        rows = jobs(scene, Path(folder) / "out", data.resolve())
+        rows = jobs(Path(folder) / "out")
         chosen = {name: job for name, job in rows.items() if only in name}
         if not chosen:
             raise ValueError(f"--only: no row has {only!r} in its name")
@@ -89,18 +80,13 @@ def main(
         for job, arguments in chosen.items():
             row: dict[str, Any] = {"CPU seconds": f"{job:40s}"}
             for name, root in roots.items():
-                try:
-                    figures: list[Any] = least(arguments, root, bytecode, rounds)
-                except ValueError:  # an earlier version may have no such command yet
-                    if root is ROOT:
-                        raise
-                    figures = ["-"] * len(FIGURES)
+                figures = least(arguments, root, bytecode, rounds)
                 row |= {f"{name}, {each}": x for each, x in zip(FIGURES, figures, strict=True)}
             results.append(row)
             lines = table(None, [row]).splitlines()
             print("\n".join(lines if len(results) == 1 else lines[-1:]))
     settings = settings_of({"rounds": rounds, "before": before})
-    write(out / "first_result.json", settings=settings, rows=results)
+    data(out / "first_result.json", settings=settings, rows=results)
     print(f"results: {out}/")
 
 
@@ -130,8 +116,8 @@ def spent(job: Arguments, root: Path, programs: Path, bytecode: Path) -> Spent:
     return usage._replace(**json.loads(lines[-1])) if job[0] == "-c" and lines else usage
 
 
-def jobs(scene: Path, out: Path, data: Path) -> dict[str, Arguments]:
-    """All rows of the table, in order; commands track a scene, and sequences of `data`."""
+def jobs(out: Path) -> dict[str, Arguments]:
+    """All rows of the table, in order."""
     calls = {
         "run_filter, particle filter": "run(mpfjax.particle_filter(model, 1000))",
         "run_filter, mixture, M = 4": "run(mixture(4))",
@@ -145,43 +131,10 @@ def jobs(scene: Path, out: Path, data: Path) -> dict[str, Arguments]:
             "mixture(4).step(key, state, observations[0])[0].log_weights.block_until_ready()"
         ),
     }
-    detections, pets = str(scene / "det.txt"), data / "pets09_s2l1"
-
-    def track(source: Path, *options: str) -> Arguments:
-        return "-m", "mpfjax", "track", str(source), "--out", str(out), *options
-
-    first, only = scene / "first", ("--no-video",)
-    truth = np.loadtxt(scene / "gt.txt", delimiter=",", max_rows=8)
-    inside = truth[(truth[:, 2:4] >= 0).all(axis=1)][0]
-    box = f"--box={','.join(f'{value:.0f}' for value in inside[2:6])}"
     calls_by_name = {"import mpfjax": ("-c", "import mpfjax")}
     calls_by_name |= {name: ("-c", _BEGIN + call + _END) for name, call in calls.items()}
-    calls_by_name |= {
-        "mpfjax track, detections, one frame": track(first, "--detections", detections, *only),
-        "mpfjax track, detections": track(scene, "--detections", detections),
-        "mpfjax track, detections alone": track(scene / "det.txt"),
-        "mpfjax track --box, one frame": track(first, box, *only),
-        "mpfjax track --box": track(scene, box),
-    }
-    if pets.is_dir():
-        name = "mpfjax track, 795 frames of PETS"
-        calls_by_name[name] = track(pets, "--detections", str(pets / "det.txt"))
     command = "-m", "benchmarks.score_vs_particles", "--out", str(out)
     return calls_by_name | {"README's first command": command}
-
-
-def render(folder: Path) -> Path:
-    """A football scene as images, with its truth for detections."""
-    scene = football_scene(jax.random.key(0), 60, num_players=8, num_opponents=0)
-    (folder / "img").mkdir(parents=True)
-    for number, frame in enumerate(np.asarray(scene.frames), 1):
-        Image.fromarray(frame).save(folder / "img" / f"{number:06d}.jpg")
-    # Without a truth beside it, which would be scored with.
-    (folder / "first" / "img").mkdir(parents=True)
-    shutil.copy(folder / "img" / "000001.jpg", folder / "first" / "img")
-    write_tracks(folder / "gt.txt", scene.tracks)
-    shutil.copy(folder / "gt.txt", folder / "det.txt")
-    return folder
 
 
 if __name__ == "__main__":

@@ -144,11 +144,10 @@ static void find_parents(const float *restrict weights, float total, float shift
 }
 
 /* One run. `keys` has two words for each step, and two for x_0; `shifts` one number for each step.
-   Every array of particles has room for n filled up to a multiple of BLOCK. `parts` is 1 to draw,
-   2 to weigh as well, 3 for the whole filter. Of each step come the mean, the effective sample
-   size and the increment of the log-likelihood, 3 numbers. */
+   Every array of particles has room for n filled up to a multiple of BLOCK. Of each step come the
+   mean, the effective sample size and the increment of the log-likelihood, 3 numbers. */
 void run(const uint32_t *keys, const float *shifts, const float *observations, int num_steps, int n,
-         int parts, float sigma_x, float sigma_y, float low, float high,
+         float sigma_x, float sigma_y, float low, float high,
          float *restrict states, float *restrict moved, float *restrict log_weights,
          float *restrict weights, int32_t *restrict parents, float *restrict found) {
   const float log_scale = -logf(sigma_y) - 0.918938533f, precision = 1 / sigma_y;
@@ -164,7 +163,7 @@ void run(const uint32_t *keys, const float *shifts, const float *observations, i
   for (int t = 0; t < num_steps; t++, found += 3) {
     const uint32_t a = keys[2 * t], b = keys[2 * t + 1], key[3] = {a, b, a ^ b ^ 0x1BD11BDA};
     const float y = observations[t];
-    if (parts > 2 && t > 0) {
+    if (t > 0) {
       find_parents(weights, total, shifts[t], n, parents);
       for (int i = 0; i < n; i++) moved[i] = states[parents[i]];
       memcpy(states, moved, 4 * n);
@@ -178,7 +177,6 @@ void run(const uint32_t *keys, const float *shifts, const float *observations, i
         log_weights[i + j] = log_scale - 0.5f * gap * gap;
       }
     }
-    if (parts < 2) continue;
     float largest = -3e38f, squares = 0, mean = 0;
     total = 0;
     for (int i = 0; i < n; i++) largest = log_weights[i] > largest ? log_weights[i] : largest;

@@ -1,4 +1,4 @@
-"""The plain filter beside one written by hand in C, and what each part of a step costs.
+"""The plain filter beside one written by hand in C.
 
     python -m benchmarks.hand_written_c
 
@@ -8,9 +8,9 @@ this one) is compiled by GCC for this processor. It is written for this model al
 else, and draws by the same Threefry and the same polynomials. Both share the seeds among threads,
 take turns, and are timed once their log-likelihoods agree with each other's and with the exact one.
 
-The parts are differences: a run that draws, one that weighs as well, and the whole filter. Printed
-are nanoseconds of processor time for a particle and step, medians over the turns, and the medians
-of the turns' ratios, of processor time and by the clock. Into --out DIR goes hand_written_c.json.
+Printed are nanoseconds of processor time for a particle and step, medians over the turns, and the
+medians of the turns' ratios, of processor time and by the clock. Into --out DIR goes
+hand_written_c.json.
 """
 
 import ctypes
@@ -19,27 +19,23 @@ import shutil
 import subprocess
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-import mpfjax
 from benchmarks.harness import AtLeast2, Count, command, data, ratio, settings_of, table, turns
 from benchmarks.peers.__main__ import disagreement, exact_log_likelihood
 from benchmarks.peers.jobs import Quadratic
-from benchmarks.peers.libraries import model_of, through_mpfjax
+from benchmarks.peers.libraries import through_mpfjax
 from mpfjax.console import whole
 
 SOURCE = Path(__file__).with_suffix(".c")
 FLAGS = ["-O3", "-march=native", "-ffast-math", "-std=gnu11", "-shared", "-fPIC"]
 BLOCK = 64
-DRAW, WEIGH, ALL = 1, 2, 3  # the parts of a run, for the C program
 
 
 @command(particles=[999, 1025], repeats=2)
@@ -64,7 +60,7 @@ def main(
         by_hand = HandWritten(library, job, size, seeds, threads)
         seconds = compare(by_hand, job, exact, seeds, repeats)
         number = size * seeds * job.num_steps
-        results += [{"N": size, **row} for row in as_rows(seconds, number)]
+        results.append({"N": size, **as_row(seconds, number)})
     print(table(None, results))
     data(out / "hand_written_c.json", settings=settings, results=results)
 
@@ -101,18 +97,18 @@ class HandWritten:
             for arrays in self._arrays
         ]  # fmt: skip
 
-    def run(self, runs: list[tuple[np.ndarray, ...]], parts: int = ALL) -> np.ndarray:
+    def run(self, runs: list[tuple[np.ndarray, ...]]) -> np.ndarray:
         """The means, sample sizes and increments of every run, (seeds, t, 3)."""
-        return np.stack(list(self._threads.map(self._run, runs, [parts] * len(runs))))
+        return np.stack(list(self._threads.map(self._run, runs)))
 
-    def _run(self, inputs: tuple[np.ndarray, ...], parts: int) -> np.ndarray:
+    def _run(self, inputs: tuple[np.ndarray, ...]) -> np.ndarray:
         keys, shifts, arrays = inputs
         job = self._job
         results = np.zeros((len(shifts), 3), np.float32)
         numbers = map(ctypes.c_float, (job.sigma_x, job.sigma_y, job.low, job.high))
         self._library.run(
             *map(_address, (keys, shifts, self._observations)),
-            len(shifts), self.num_particles, parts, *numbers, *map(_address, arrays),
+            len(shifts), self.num_particles, *numbers, *map(_address, arrays),
             _address(results),
         )  # fmt: skip
         return results
@@ -122,39 +118,17 @@ def _address(array: np.ndarray) -> ctypes.c_void_p:
     return array.ctypes.data_as(ctypes.c_void_p)
 
 
-def through_parts(job: Quadratic, num_particles: int) -> dict[int, Callable[[Any], Any]]:
-    """Runs of mpfjax over the keys: one that draws, one that weighs as well, and the filter."""
-    model, observations = model_of(job), jnp.asarray(job.observations)
-    weighing = mpfjax.Filter(model, [mpfjax.Propagate()], num_particles)
-    unseen = jnp.full_like(observations, jnp.nan)
-    sums = lambda mixture: jnp.sum(mixture.particles)  # noqa: E731
-    moments = lambda mixture: (mixture.mean(), mixture.effective_sample_size)  # noqa: E731
-
-    def draw(keys: Any) -> Any:
-        """A filter without observations; the sum needs every particle."""
-        run = mpfjax.monte_carlo(keys, weighing, mpfjax.Series.skipping(unseen), sums)
-        return jax.block_until_ready(run.collected)
-
-    def weigh(keys: Any) -> Any:
-        run = mpfjax.monte_carlo(keys, weighing, observations, moments)
-        return jax.block_until_ready(run.collected)
-
-    return {DRAW: draw, WEIGH: weigh, ALL: through_mpfjax(job, num_particles)}
-
-
 def compare(
     by_hand: HandWritten, job: Quadratic, exact: float, num_seeds: int, repeats: int
-) -> dict[tuple[str, int], np.ndarray]:
-    """Seconds of both by the processor and by the clock, (turns, 2), of each part; raises where
-    their answers differ.
+) -> dict[str, np.ndarray]:
+    """Seconds of both by the processor and by the clock, (turns, 2); raises where their answers
+    differ.
     """
-    # Of runs without resampling, which are meant to degenerate.
-    warnings.simplefilter("ignore", RuntimeWarning)
-    ours = through_parts(job, by_hand.num_particles)
+    ours = through_mpfjax(job, by_hand.num_particles)
     # The first turn compiles; what it is given says whether both agree.
     keys = [jax.random.split(jax.random.key(turn), num_seeds) for turn in range(1 + repeats)]
     inputs = [by_hand.prepared(turn) for turn in range(1 + repeats)]
-    _, sizes, log_likelihoods = ours[ALL](keys[0])
+    _, sizes, log_likelihoods = ours(keys[0])
     results = by_hand.run(inputs[0])
     reason = disagreement(
         {
@@ -166,28 +140,21 @@ def compare(
     )
     if reason is not None:
         raise ValueError(f"N = {by_hand.num_particles}: the C program's {reason}")
-    runs: dict[tuple[str, int], Callable[[int], Any]] = {}
-    for part, one in ours.items():
-        runs["mpfjax", part] = lambda turn, one=one: one(keys[turn])
-        runs["C", part] = lambda turn, part=part: by_hand.run(inputs[turn], part)
+    runs: dict[str, Callable[[int], Any]] = {
+        "mpfjax": lambda turn: ours(keys[turn]), "C": lambda turn: by_hand.run(inputs[turn])
+    }  # fmt: skip
     both: Any = lambda: np.array([time.process_time(), time.perf_counter()])  # noqa: E731
     return turns(runs, repeats, clock=both)
 
 
-def as_rows(seconds: dict[tuple[str, int], np.ndarray], number: int) -> list[dict[str, Any]]:
-    """Nanoseconds of each part for mpfjax, with the ratios, and for the C program."""
-    rows = []
-    for who in ("mpfjax", "C"):
-        draw, weigh, whole = (
-            1e9 * np.median(seconds[who, part][:, 0]) / number for part in (DRAW, WEIGH, ALL)
-        )
-        parts = {"draw": draw, "weigh": weigh - draw, "resample": whole - weigh, "all": whole}
-        rows.append({"": who, **parts})
-    ours, theirs = seconds["mpfjax", ALL], seconds["C", ALL]
-    rows[0] |= {
-        "ratio": ratio(ours[:, 0], theirs[:, 0]), "by the clock": ratio(ours[:, 1], theirs[:, 1])
+def as_row(seconds: dict[str, np.ndarray], number: int) -> dict[str, float]:
+    """Nanoseconds of both, and the ratios."""
+    (ours, ours_by_clock), (theirs, theirs_by_clock) = seconds["mpfjax"].T, seconds["C"].T
+    return {
+        "mpfjax": 1e9 * float(np.median(ours)) / number,
+        "C": 1e9 * float(np.median(theirs)) / number,
+        "ratio": ratio(ours, theirs), "by the clock": ratio(ours_by_clock, theirs_by_clock),
     }  # fmt: skip
-    return rows
 
 
 if __name__ == "__main__":

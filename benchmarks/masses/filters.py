@@ -33,7 +33,7 @@ def _change(make: Make, change: Callable[[mpfjax.Filter], mpfjax.Filter]) -> Mak
 def _learn(scene: Scene, num_particles: int) -> mpfjax.Filter:
     """The mixture filter, which knows the whole series from five earlier runs."""
     plain = _mixture()(scene, num_particles)
-    return learn_lookahead(jax.random.key(0), plain, scene.observations, features=scene.features)
+    return learn_lookahead(jax.random.key(0), plain, scene.observations)
 
 
 _EQUAL_SLOTS = partial(mpfjax.with_resampling, resample=mpfjax.Resample(allocation="equal"))

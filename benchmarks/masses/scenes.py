@@ -12,10 +12,7 @@ import mpfjax
 from benchmarks.masses import models
 from mpfjax.exact import grid_filter
 
-GRID = jnp.linspace(-5.0, 5.0, 4001)
-JUMP_GRID = jnp.linspace(-30.0, 30.0, 2401)
-# How far from the vehicle a particle may be and still count as near it, in kilometres.
-NEAR = 0.3
+GRID = jnp.linspace(-30.0, 30.0, 2401)
 
 
 class Scene(NamedTuple):
@@ -23,8 +20,7 @@ class Scene(NamedTuple):
 
     - `region`: which region each particle is in, (n,), at the end; there are `num_regions`.
     - `grouping`: the coordinates and units in which components are grouped.
-    - `exact`: the masses and log Z, where a grid or symmetry tells them; else None.
-    - `features`: of a state, by which a look-ahead is learned; None is the state itself.
+    - `exact`: the masses, by a grid or symmetry, and log Z, None without a grid.
     - `truth`: the region that the observations come from.
     """
 
@@ -33,8 +29,7 @@ class Scene(NamedTuple):
     region: Callable[[PyTree], Array]
     max_components: int
     grouping: dict[str, Any]
-    exact: tuple[np.ndarray, float | None] | None = None
-    features: Callable[[PyTree], Array] | None = None
+    exact: tuple[np.ndarray, float | None]
     truth: int = 0
     num_regions: int = 2
 
@@ -65,29 +60,6 @@ def corridor(num_steps: int, seed: int) -> Scene:
     )  # fmt: skip
 
 
-def quadratic(num_steps: int, seed: int) -> Scene:
-    """Section 5.1 of Vermaak et al. (2003), with independent draws of x_0; two masses of a half."""
-    rng = np.random.default_rng(seed)
-    model = mpfjax.QuadraticModel(initial_draw="independent")
-    path = 2 * np.sin(2 * np.pi * np.arange(1, num_steps + 1) / 100)
-    observations = (path**2 + 0.1 * rng.normal(size=num_steps)).astype(np.float32)
-    exact = of_grid(model, observations, GRID)
-    return Scene(
-        model, observations, by_sign, 2, {}, exact=exact,
-        truth=int(path[-1] > 0),
-    )  # fmt: skip
-
-
-def bearings(num_steps: int, seed: int) -> Scene:
-    """A target on either side of two lines of hydrophones."""
-    model = models.Bearings()
-    return Scene(
-        model, model.simulate(num_steps, seed), lambda states: by_sign(states["motion"][:, 1]), 4,
-        {"features": lambda states: states["motion"][:, :2], "scale": 4.0},
-        features=models.motion_and_turn, truth=1,
-    )  # fmt: skip
-
-
 def mirror(num_steps: int, seed: int) -> Scene:
     """Two halves in four dimensions, each the mirror image of the other."""
     model = models.Mirror()
@@ -98,25 +70,11 @@ def mirror(num_steps: int, seed: int) -> Scene:
     )  # fmt: skip
 
 
-def terrain(num_steps: int, seed: int) -> Scene:
-    """A flight over hills: many modes, one of them near the vehicle."""
-    model = models.Terrain.drawn(seed + 3)
-    path, observations = model.simulate(num_steps, seed + 3)
-    place = jnp.asarray(path[-1])
-
-    def is_near(states: Array) -> Array:
-        return (jnp.sum((states - place[None]) ** 2, axis=1) < NEAR**2).astype(jnp.int32)
-
-    return Scene(
-        model, observations, is_near, 8, {"scale": 1.0}, truth=1,
-    )  # fmt: skip
-
-
 def jumps(num_steps: int, seed: int) -> Scene:
     """A target that jumps now and then: two sides, and which of them is settled by and by."""
     model = models.Jumps()
     path, observations = model.simulate(num_steps, seed + 4)
-    exact = of_grid(model, observations, JUMP_GRID)
+    exact = of_grid(model, observations, GRID)
     return Scene(
         model, observations, by_sign, 4, {"scale": 1.0}, exact=exact,
         truth=int(path[-1] > 0),
@@ -126,9 +84,6 @@ def jumps(num_steps: int, seed: int) -> Scene:
 # The scene, and its number of steps.
 SCENES: dict[str, tuple[Callable[[int, int], Scene], int]] = {
     "corridor": (corridor, 80),
-    "quadratic": (quadratic, 100),
-    "bearings": (bearings, 40),
     "mirror": (mirror, 40),
-    "terrain": (terrain, 30),
     "jumps": (jumps, 40),
 }

@@ -29,14 +29,11 @@ class Scene(NamedTuple):
       frames count from 1, and (x, y) is the top-left corner in pixels. A player who is hidden by
       another has a box too.
     - `kits`: the kit of each player by id, 0 for the players to track and 1 for the others.
-    - `landmarks`: (t, k, 2), where k fixed points of the pitch are in each frame, in pixels, also
-      outside of it: the true motion of the camera.
     """
 
     frames: UInt8[np.ndarray, "t h w 3"]
     tracks: Float[np.ndarray, "rows 6"]
     kits: dict[int, int]
-    landmarks: Float[np.ndarray, "t k 2"]
 
 
 class _Camera(NamedTuple):
@@ -113,10 +110,7 @@ def football_scene(
         rows += _draw_players(frame, camera, paths[: t + 1], kits, strides)
         noise = 2.5 * rng.standard_normal((height, width, 1), dtype=np.float32)
         frames.append(np.clip(frame + noise, 0, 255).astype(np.uint8))
-    across, along = np.meshgrid(np.arange(-40.0, 41.0, 4.0), np.arange(*_PITCH_DEPTH, 6.0))
-    points = np.stack([across, along, np.zeros_like(along)], axis=-1).reshape(-1, 3)
-    landmarks = np.stack([camera.project(points)[0] for camera in cameras])
-    return Scene(np.stack(frames), np.array(rows), dict(enumerate(kits, 1)), landmarks)
+    return Scene(np.stack(frames), np.array(rows), dict(enumerate(kits, 1)))
 
 
 def _team_paths(rng: np.random.Generator, num_frames: int, size: int, kit: int) -> np.ndarray:
