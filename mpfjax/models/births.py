@@ -13,13 +13,7 @@ from jax.core import Tracer
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.arrays import (
-    FINITE,
-    POSITIVE,
-    Fitting,
-    check_spacing,
-    to_array,
-)
+from mpfjax.arrays import FINITE, POSITIVE, Fitting, check_spacing, to_array
 from mpfjax.operations.random import normal, split, uniform
 
 Rate = Annotated[Float[Array, ""], POSITIVE]

@@ -8,11 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.arrays import (
-    POSITIVE,
-    Fitting,
-    to_array,
-)
+from mpfjax.arrays import POSITIVE, Fitting, to_array
 from mpfjax.checks import SHARES
 from mpfjax.models.base import AbstractStateSpaceModel, is_made_of_noise, over_particles
 from mpfjax.models.law import law_of, refuse_marginalised

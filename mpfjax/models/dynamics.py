@@ -8,18 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from mpfjax.arrays import (
-    FINITE,
-    NOT_NEGATIVE,
-    POSITIVE,
-    Fitting,
-    to_array,
-    to_numbers,
-)
-from mpfjax.checks import (
-    SHARES,
-    InnerShare,
-)
+from mpfjax.arrays import FINITE, NOT_NEGATIVE, POSITIVE, Fitting, to_array, to_numbers
+from mpfjax.checks import SHARES, InnerShare
 from mpfjax.models.gaussians import log_normal
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 from mpfjax.operations.random import fast_key, normal, split_once

@@ -9,16 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.arrays import (
-    COVARIANCE,
-    FINITE,
-    Fitting,
-    to_array,
-)
-from mpfjax.checks import (
-    check_shape,
-    entries,
-)
+from mpfjax.arrays import COVARIANCE, FINITE, Fitting, to_array
+from mpfjax.checks import check_shape, entries
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
 from mpfjax.models.gaussians import log_multinormal

@@ -10,11 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.arrays import (
-    POSITIVE,
-    Fitting,
-    to_array,
-)
+from mpfjax.arrays import POSITIVE, Fitting, to_array
 from mpfjax.checks import Checked, Count, check_one_each
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import (

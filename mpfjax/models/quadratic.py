@@ -7,11 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mpfjax.arrays import (
-    POSITIVE,
-    Fitting,
-    to_array,
-)
+from mpfjax.arrays import POSITIVE, Fitting, to_array
 from mpfjax.checks import Finite
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.gaussians import log_normal

@@ -6,11 +6,7 @@ from typing import Annotated, Any
 import equinox as eqx
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.arrays import (
-    NOT_NEGATIVE,
-    Fitting,
-    to_array,
-)
+from mpfjax.arrays import NOT_NEGATIVE, Fitting, to_array
 from mpfjax.checks import SHARES, is_series
 from mpfjax.models.base import AbstractStateSpaceModel, over_particles
 from mpfjax.models.births import AbstractBirth

@@ -9,18 +9,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.arrays import (
-    POSITIVE,
-    Fitting,
-    check_spacing,
-    to_array,
-)
-from mpfjax.checks import (
-    NotNegative,
-    Rule,
-    check,
-    warn,
-)
+from mpfjax.arrays import POSITIVE, Fitting, check_spacing, to_array
+from mpfjax.checks import NotNegative, Rule, check, warn
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.gaussians import log_normal
 from mpfjax.operations.random import normal, split, uniform

@@ -10,17 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
-from mpfjax.arrays import (
-    FINITE,
-    Fitting,
-    check_spacing,
-    to_numbers,
-)
-from mpfjax.checks import (
-    Positive,
-    checked,
-    warn,
-)
+from mpfjax.arrays import FINITE, Fitting, check_spacing, to_numbers
+from mpfjax.checks import Positive, checked, warn
 from mpfjax.extras import optional
 from mpfjax.models.base import replace_fields
 from mpfjax.operations.stored import stored

@@ -7,12 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mpfjax.arrays import (
-    NOT_NEGATIVE,
-    Fitting,
-    to_array,
-    to_rows,
-)
+from mpfjax.arrays import NOT_NEGATIVE, Fitting, to_array, to_rows
 from mpfjax.checks import NotNegative, checked
 from mpfjax.robots.maps import Poses
 

@@ -9,22 +9,8 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.arrays import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    Fitting,
-    to_array,
-    to_numbers,
-)
-from mpfjax.checks import (
-    Count,
-    Exponent,
-    NotNegative,
-    Positive,
-    check_shape,
-    entries,
-    warn,
-)
+from mpfjax.arrays import NOT_NEGATIVE, POSITIVE, Fitting, to_array, to_numbers
+from mpfjax.checks import Count, Exponent, NotNegative, Positive, check_shape, entries, warn
 from mpfjax.models.gaussians import log_normal
 from mpfjax.operations.stored import stored
 from mpfjax.robots.maps import Angles, Beams, OccupancyGrid, Poses, ends_of

@@ -18,12 +18,7 @@ from mpfjax.moves.resampling.sorting import (
     order_by_key,
     sortable_bits,
 )
-from mpfjax.operations.random import (
-    direction_numbers,
-    scramble,
-    scrambled_directions,
-    sobol_points,
-)
+from mpfjax.operations.random import direction_numbers, scramble, scrambled_directions, sobol_points
 
 # As one program each: to compile operations one by one takes longer.
 hilbert_index, order_by_key, sortable_bits = map(

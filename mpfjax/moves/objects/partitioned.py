@@ -10,9 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.arrays import (
-    to_rows,
-)
+from mpfjax.arrays import to_rows
 from mpfjax.checks import check, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel

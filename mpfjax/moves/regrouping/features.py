@@ -9,10 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from mpfjax.arrays import (
-    POSITIVE,
-    to_numbers,
-)
+from mpfjax.arrays import POSITIVE, to_numbers
 from mpfjax.checks import Checked, check_shape, saying
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.logarithms import as_inexact
