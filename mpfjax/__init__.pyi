@@ -25,10 +25,6 @@ from mpfjax.filters import partitioned_sampling as partitioned_sampling
 from mpfjax.mixture import ParticleMixture as ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel as AbstractStateSpaceModel
 from mpfjax.models.base import per_particle as per_particle
-from mpfjax.models.births import AbstractBirth as AbstractBirth
-from mpfjax.models.births import Box as Box
-from mpfjax.models.births import Disc as Disc
-from mpfjax.models.births import UniformBirth as UniformBirth
 from mpfjax.models.clutter import ClutteredModel as ClutteredModel
 from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel as AbstractConditionallyLinearModel,
@@ -43,8 +39,12 @@ from mpfjax.models.multi_object import MultiObjectModel as MultiObjectModel
 from mpfjax.models.multi_object import PairwiseRepulsion as PairwiseRepulsion
 from mpfjax.models.quadratic import QuadraticModel as QuadraticModel
 from mpfjax.models.series import Series as Series
-from mpfjax.models.simulation import simulate as simulate
+from mpfjax.models.series import simulate as simulate
+from mpfjax.models.targets import AbstractBirth as AbstractBirth
+from mpfjax.models.targets import Box as Box
+from mpfjax.models.targets import Disc as Disc
 from mpfjax.models.targets import TargetsModel as TargetsModel
+from mpfjax.models.targets import UniformBirth as UniformBirth
 from mpfjax.moves.base import AbstractMarkovMove as AbstractMarkovMove
 from mpfjax.moves.base import AbstractMove as AbstractMove
 from mpfjax.moves.base import AbstractPropagation as AbstractPropagation

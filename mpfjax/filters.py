@@ -22,14 +22,13 @@ from mpfjax.moves.objects.bernoulli import Associate
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, Reassembly
-from mpfjax.moves.objects.regeneration import RegenerateObjects
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import OnCircles, Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
 from mpfjax.moves.regrouping.merge import Merge
 from mpfjax.moves.regrouping.partitions import Pool, RandomPartition
 from mpfjax.moves.regrouping.split import Split
-from mpfjax.moves.resampling.gaussian import GaussianRegeneration
+from mpfjax.moves.resampling.gaussian import GaussianRegeneration, RegenerateObjects
 from mpfjax.moves.resampling.resample import Resample, Scheme
 from mpfjax.transforms import (
     with_initial_selection,

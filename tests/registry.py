@@ -33,8 +33,8 @@ from mpfjax import (
 )
 from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.moves.objects.exclusion import Exclusion
-from mpfjax.moves.objects.regeneration import RegenerateObjects
 from mpfjax.moves.propagation.propagate import Predict, Reweight
+from mpfjax.moves.resampling.gaussian import RegenerateObjects
 
 NUM_PARTICLES = 48
 # On either side of the number of components up to which they are worked on as rows.

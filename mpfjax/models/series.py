@@ -1,4 +1,4 @@
-"""The data of all steps: observations, which of them are missing, and known inputs."""
+"""The data of all steps: observations, which of them are missing, known inputs; and drawn ones."""
 
 import warnings
 from typing import Any, Literal
@@ -8,10 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Key, PyTree
 
-from mpfjax.checks import array_of_numbers, check, check_shape, warn
-from mpfjax.models.base import innermost
+from mpfjax.checks import Count, array_of_numbers, check, check_shape, checked, warn
+from mpfjax.models.base import (
+    AbstractStateSpaceModel,
+    asking,
+    check_moved,
+    check_states,
+    innermost,
+    require,
+    with_inputs,
+)
 from mpfjax.models.observations import (
     NOT_FINITE,
     USABLE,
@@ -23,6 +31,7 @@ from mpfjax.models.observations import (
     require_inputs,
     steps_where,
 )
+from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 _EXACT, _FAR = 2**24, 2**17  # float32 holds whole numbers up to the first, and 1/64 at the second
 
@@ -218,3 +227,49 @@ def _length(arrays: PyTree, tree: PyTree, name: str) -> int:
         hint = hint if isinstance(tree, list | tuple) else ""
         raise ValueError(f"{name}: shapes {shapes} do not share a leading axis t > 0{hint}")
     return shapes[0][0]
+
+
+@checked
+def simulate(
+    key: Key[Array, ""], model: AbstractStateSpaceModel, num_steps: Count, *, inputs: PyTree = None
+) -> tuple[PyTree, PyTree]:
+    """Draw x_0, ..., x_t, leaves (t + 1, ...), and y_1, ..., y_t, leaves (t, ...), from a model.
+
+    The model defines `sample_observation(key, states)`, y given each of n states; it raises
+    `ValueError` otherwise, and for objects with an interaction, which weighs states and draws none.
+    `inputs` are as for `run_filter`. Use it to test a filter on data whose states are known.
+    """
+    require(model, "sample_observation", "simulate")
+    if getattr(model, "interaction", None) is not None:
+        raise ValueError("interaction: a model with one gives weights, and cannot be simulated")
+    inputs = steps_of_inputs(inputs, num_steps, model, "steps")
+    return with_floats_traced(lambda model: _simulate(key, model, num_steps, inputs), model)
+
+
+@jit_on_wide_vectors
+def _simulate(key, model, num_steps, inputs):
+    key_initial, key_steps = jax.random.split(key)
+    initial = model.sample_initial(key_initial, 1)
+    check_states(initial, model, "sample_initial", 1)
+    states, observations = steps_ahead(key_steps, model, initial, num_steps, inputs)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), initial, states), observations
+
+
+def steps_ahead(
+    key: Key[Array, ""], model: Any, state: PyTree, num_steps: int, inputs: PyTree
+) -> tuple[PyTree, PyTree]:
+    """Draw the next states and observations from a state, leaves (1, ...): (k, ...) of each."""
+
+    def advance(state: PyTree, step: tuple[Array, PyTree]) -> tuple[PyTree, tuple[PyTree, PyTree]]:
+        step_key, now = step
+        key_state, key_observation = jax.random.split(step_key)
+        at_step = with_inputs(model, now)
+        with asking(at_step, "sample_transition"):
+            moved = at_step.sample_transition(key_state, state)
+        check_moved(moved, state, model)
+        with asking(at_step, "sample_observation"):
+            observation = at_step.sample_observation(key_observation, moved)
+        check_states(observation, model, "sample_observation", 1)
+        return moved, jax.tree.map(lambda leaf: leaf[0], (moved, observation))
+
+    return jax.lax.scan(advance, state, (jax.random.split(key, num_steps), inputs))[1]

@@ -22,11 +22,10 @@ from mpfjax.models.base import (
     require_noise,
     with_inputs,
 )
-from mpfjax.models.births import UniformBirth
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
 from mpfjax.models.law import law_of
 from mpfjax.models.observations import one_input, one_observation
-from mpfjax.models.targets import TargetsModel
+from mpfjax.models.targets import TargetsModel, UniformBirth
 from mpfjax.moves.base import AbstractProposal, Step
 from mpfjax.operations.compiling import in_little_memory, jit_with, with_floats_traced
 from mpfjax.trial.statistics import density_faults, origin_faults

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import Count, checked
 from mpfjax.models.base import require, with_inputs
 from mpfjax.models.law import refuse_marginalised
-from mpfjax.models.series import Series, steps_of_inputs
-from mpfjax.models.simulation import steps_ahead
+from mpfjax.models.series import Series, steps_ahead, steps_of_inputs
 from mpfjax.moves.base import check_keep_parents
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.smoothing.backward import draw

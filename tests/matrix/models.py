@@ -11,7 +11,7 @@ import numpy as np
 from jax.scipy.stats import norm
 
 import mpfjax
-from mpfjax.models.births import AbstractBirth
+from mpfjax.models.targets import AbstractBirth
 from tests.matrix import law as exact
 from tests.matrix.law import Law
 

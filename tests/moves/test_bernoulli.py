@@ -15,8 +15,8 @@ import mpfjax
 from mpfjax import ClutteredModel, Filter, TargetsModel
 from mpfjax.moves.objects.association import associate
 from mpfjax.moves.objects.bernoulli import TARGETS, Associate
-from mpfjax.moves.objects.regeneration import RegenerateObjects
 from mpfjax.moves.propagation.propagate import Predict
+from mpfjax.moves.resampling.gaussian import RegenerateObjects
 from tests.marking import weekly
 from tests.models.test_clutter import SETS, by_associations
 from tests.unbiased import assert_unbiased

@@ -7,8 +7,8 @@ import yaml
 from PIL import Image
 
 from mpfjax import robots
-from mpfjax.models.births import Box, Disc
 from mpfjax.models.series import check_differences
+from mpfjax.models.targets import Box, Disc
 
 SOLID = np.zeros((60, 60), bool)
 SOLID[[0, -1]] = SOLID[:, [0, -1]] = SOLID[20:40, 20:40] = True
