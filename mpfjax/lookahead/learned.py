@@ -16,7 +16,7 @@ from mpfjax.lookahead.regression import fit_lookahead
 from mpfjax.lookahead.twisted import PropagateTwisted, RegroupTwisted, Twist, TwistInitial
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import is_made_of_noise, over_particles, require_noise
-from mpfjax.models.conditionally_linear import is_mixed, with_moments
+from mpfjax.models.conditionally_linear import is_mixed
 from mpfjax.models.law import law_of
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.series import as_series
@@ -103,7 +103,7 @@ def _knowing_nothing(
 ) -> Twist:
     """ψ = 1 at every step."""
     of_states = over_particles(model, features) or flatten_states
-    states = jax.eval_shape(lambda key: with_moments(model, model.sample_initial(key, 2)), key)
+    states = jax.eval_shape(lambda key: law_of(model).sample_initial(key, 2), key)
     num_features = math.prod(jax.eval_shape(of_states, states).shape[1:])
     dtype = noise_dtype(states)
     noise = jax.eval_shape(lambda states: jnp.zeros(law_of(model).noise_dimension(states)), states)

@@ -13,7 +13,6 @@ from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.lookahead.twisted import Twist
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import with_inputs
-from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.law import law_of
 from mpfjax.models.series import Series
 from mpfjax.running.results import FilterRun
@@ -171,7 +170,7 @@ def _fit_initial(
         dtype = used.slopes.dtype
         standard = jax.random.normal(key, shape, dtype)
         noise, log_ratio = psi.draw(standard, jnp.zeros((size, 1), dtype))
-        features = twist.features_of(with_moments(model, model.initial_from_noise(noise)))
+        features = twist.features_of(law_of(model).make_initial(noise))
         return noise, features, first.log_fitted(features) + log_ratio
 
     noise, features, log_importance = draw(key_used, used)

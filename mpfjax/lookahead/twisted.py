@@ -12,7 +12,7 @@ from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.base import check_moved
-from mpfjax.models.conditionally_linear import with_moments
+from mpfjax.models.law import law_of
 from mpfjax.models.noise import draw_noise, noise_dtype
 from mpfjax.moves.base import (
     AbstractMove,
@@ -78,7 +78,7 @@ class TwistInitial(AbstractMove):
         shape, dtype = (mixture.num_particles, model.initial_noise_dimension + 1), psi.slopes.dtype
         noise = draw_noise(key, self.noise, shape, dtype)
         drawn, log_ratio = psi.draw(noise, jnp.zeros((shape[0], 1), dtype))
-        states = with_moments(model, model.initial_from_noise(drawn))
+        states = law_of(model).make_initial(drawn)
         check_moved(states, mixture.particles, model, "initial_from_noise")
         return mixture.replace(particles=states).reweight(log_ratio)
 

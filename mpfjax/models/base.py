@@ -74,20 +74,16 @@ class AbstractStateSpaceModel(eqx.Module):
 
     def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """Draw x_t ~ D(. | x_{t-1}) for every particle: `transition_from_noise` of fresh noise."""
-        return _drawn_from_noise(self, key, states)
+        model: Any = self
+        num_particles, dimension = jax.tree.leaves(states)[0].shape[0], model.noise_dimension
+        # Drawn as a vector, one column is fused with what uses it.
+        shape = (num_particles,) if dimension == 1 else (num_particles, dimension)
+        noise = normal(key, shape, noise_dtype(states)).reshape(num_particles, dimension)
+        return model.transition_from_noise(noise, states)
 
     @abc.abstractmethod
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """log L(y_t | x_t) of every particle, up to a constant shared by all of them."""
-
-
-def _drawn_from_noise(model: Any, key: Key[Array, ""], states: PyTree) -> PyTree:
-    num_particles, dtype = jax.tree.leaves(states)[0].shape[0], noise_dtype(states)
-    if model.noise_dimension == 1:  # drawn as a vector, it is fused with what uses it
-        noise = normal(key, (num_particles,), dtype)[:, None]
-    else:
-        noise = normal(key, (num_particles, model.noise_dimension), dtype)
-    return model.transition_from_noise(noise, states)
 
 
 def takes_inputs(model: Any) -> bool:

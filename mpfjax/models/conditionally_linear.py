@@ -26,7 +26,7 @@ from mpfjax.models.gaussians import (
     solve_upper,
     transpose,
 )
-from mpfjax.models.law import Law, law_of
+from mpfjax.models.law import Law
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import normal
@@ -135,7 +135,11 @@ class MarginalisedLaw(Law):
 
     def start(self, draws: PyTree) -> PyTree:
         """z_0 with the moments of x_0."""
-        return with_moments(self.model, draws)
+        mean, covariance = _initial_moments(self.model, draws)
+        n, d = jax.tree.leaves(draws)[0].shape[0], mean.shape[-1]
+        return MarginalisedState(
+            draws, jnp.broadcast_to(mean, (n, d)), jnp.broadcast_to(covariance, (n, d, d))
+        )
 
     def see(self, observation: PyTree, states: PyTree) -> tuple[PyTree, list[Float[Array, " n"]]]:
         """The moments given y_t too, and the factors of z and of x."""
@@ -162,8 +166,11 @@ class MixedLaw(MarginalisedLaw):
         return self.make(normal(key, states.latent.shape, noise_dtype(states)), states)
 
     def make(self, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
-        """z_t, made of this standard normal noise."""
-        return latent_from_noise(self.model, noise, states)
+        """z_t ~ N(f + A m, A P Aᵀ + V), made of this standard normal noise."""
+        mixed, _ = latent_dynamics_of(self.model, states)
+        law = gaussians.predict(filtered_gaussian(self.model, states), mixed)
+        drawn = law.mean + apply(cholesky(law.covariance), noise.T.astype(law.mean.dtype))
+        return drawn.T.reshape(states.latent.shape)
 
     def noise_dimension(self, states: PyTree) -> int:
         """k, the number of coordinates of z_t."""
@@ -171,20 +178,9 @@ class MixedLaw(MarginalisedLaw):
 
     def log_transition(self, draws: PyTree, states: PyTree) -> Float[Array, " n"]:
         """log p(z_t | z_{t-1}, y_1..y_{t-1})."""
-        return log_latent_density(self.model, draws, states)
-
-
-def log_predictive(
-    model: Any, observation: PyTree, latent: PyTree, state: MarginalisedState
-) -> Float[Array, " n"]:
-    """log p(y_t | z_t, z, y_1..y_{t-1}) of each particle, what is seen of z_t included."""
-    log_density = law_of(model).log_likelihood_of_draws(observation, latent)
-    emission = emission_of(model, latent, state)
-    if emission is None:
-        return log_density
-    law = predicted_gaussian(model, latent, state)
-    rows = observation_rows(model, observation, emission, state.mean.dtype)
-    return log_density + gaussians.update(law, rows, emission)[1]
+        mixed, _ = latent_dynamics_of(self.model, states)
+        rows = latent_rows(self.model, draws)
+        return gaussians.update_by_all(filtered_gaussian(self.model, states), rows, mixed)[1]
 
 
 def is_marginalised(model: Any) -> bool:
@@ -195,18 +191,6 @@ def is_marginalised(model: Any) -> bool:
 def is_mixed(model: Any) -> bool:
     """Whether z_t depends on x_{t-1}."""
     return callable(getattr(model, "latent_dynamics", None))
-
-
-def with_moments(model: Any, drawn: PyTree) -> PyTree:
-    """The particles of x_0: the model's own draws, or these with the moments of the rest."""
-    if not is_marginalised(model):
-        return drawn
-    n = jax.tree.leaves(drawn)[0].shape[0]
-    mean, covariance = _initial_moments(model, drawn)
-    d = mean.shape[-1]
-    return MarginalisedState(
-        drawn, jnp.broadcast_to(mean, (n, d)), jnp.broadcast_to(covariance, (n, d, d))
-    )
 
 
 def _initial_moments(model: Any, latent: PyTree) -> list[Array]:
@@ -264,23 +248,6 @@ def update(
     n, rows = state.mean.shape[0], observation_rows(model, observation, emission, state.mean.dtype)
     law, log_density = gaussians.update(filtered_gaussian(model, state), rows, emission)
     return _state_of(state.latent, law, n), jnp.broadcast_to(log_density, (n,))
-
-
-def latent_from_noise(
-    model: Any, noise: Float[Array, "n k"], state: MarginalisedState
-) -> Float[Array, "n k"]:
-    """z_t ~ N(f + A m, A P Aᵀ + V) of the mixed form, made of standard normal noise."""
-    law = gaussians.predict(filtered_gaussian(model, state), latent_dynamics_of(model, state)[0])
-    drawn = law.mean + apply(cholesky(law.covariance), noise.T.astype(law.mean.dtype))
-    return drawn.T.reshape(state.latent.shape)
-
-
-def log_latent_density(model: Any, latent: Array, state: MarginalisedState) -> Float[Array, " n"]:
-    """log p(z_t | z_{t-1}, y_1..y_{t-1}) of the mixed form."""
-    mixed, _ = latent_dynamics_of(model, state)
-    return gaussians.update_by_all(
-        filtered_gaussian(model, state), latent_rows(model, latent), mixed
-    )[1]
 
 
 def latent_rows(model: Any, latent: Any) -> Float[Array, "k n"]:

@@ -131,7 +131,7 @@ class RandomWalkWithJumps(RandomWalk):
     """
 
     jump_deviations: Deviations = eqx.field(converter=to_array("jump_deviations"))
-    jump_probability: InnerShare = eqx.field(static=True, default=0.03)
+    jump_probability: InnerShare = eqx.field(static=True)
 
     @property
     def noise_dimension(self) -> int:
@@ -178,7 +178,7 @@ class WalkWithVelocity(AbstractDynamics):
     - `walk`: the noise of x_t, a `RandomWalk` or `RandomWalkWithJumps`.
     - `gain`: in [0, 1], a number or one per coordinate. v averages over about 1 / gain steps.
     - `initial_velocity`: standard deviations of v_0 about 0, in the shape of the walk's deviations,
-      in units of the state per frame; None is 0.
+      in units of the state per frame.
 
     Raises `ValueError` for a gain outside [0, 1] and a negative deviation. Use it if objects keep
     their velocity: similar objects that cross retain their identities, and a hidden object moves
@@ -189,10 +189,10 @@ class WalkWithVelocity(AbstractDynamics):
 
     walk: RandomWalk
     gain: Annotated[tuple[float, ...], SHARES] = eqx.field(
-        static=True, converter=to_numbers("gain"), default=0.1
+        static=True, converter=to_numbers("gain")
     )
-    initial_velocity: Annotated[Float[Array, "*n d"], NOT_NEGATIVE] | None = eqx.field(
-        converter=to_array("initial_velocity"), default=None
+    initial_velocity: Annotated[Float[Array, "*n d"], NOT_NEGATIVE] = eqx.field(
+        converter=to_array("initial_velocity")
     )
 
     @property
@@ -229,8 +229,6 @@ class WalkWithVelocity(AbstractDynamics):
 
     def initial_past(self, key: Key[Array, ""], current: Rows) -> Rows:
         """x_0 - v_0, with v_0 ~ N(0, diag(initial_velocity²))."""
-        if self.initial_velocity is None:
-            return current
         deviations = jnp.broadcast_to(self.initial_velocity, current.shape)
         return current - deviations * normal(key, current.shape, current.dtype)
 

@@ -47,8 +47,6 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
       With True, all objects observe the whole observation, such as an image. If `object_model` then
       has a method `prepare_observation(observation)`, it is called once in each step, for all
       particles and objects, and its result is passed to `log_likelihood`.
-    - `shared_inputs`: with True, all objects have the same known inputs u_t. With False, object j
-      has `inputs[j]`, every leaf indexed by j.
     - `per_object`: whether the arrays have an object axis. With None they have one if the model
       cannot be sampled without it, which is traced and not computed.
 
@@ -62,7 +60,6 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
     interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None = None
     shared_observation: bool = eqx.field(static=True, default=False)
     per_object: bool | None = eqx.field(static=True, default=None, kw_only=True)
-    shared_inputs: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __post_init__(self) -> None:
         self.__check_init__()
@@ -80,17 +77,11 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
         return getattr(self.object_model, "handles_missing", False)
 
     def with_inputs(self, inputs: PyTree) -> "MultiObjectModel":
-        """The model whose objects have the inputs u_t, all the same or one each."""
-        model, per_object = self.object_model, self.per_object
-        if self.shared_inputs and not per_object:
-            model = with_inputs(model, inputs)
-        else:
-            if not self.shared_inputs:
-                check_one_each(self.num_objects, "objects", inputs=inputs)
-            axes = (eqx.if_array(0) if per_object else None, None if self.shared_inputs else 0)
-            give = eqx.filter_vmap(with_inputs, in_axes=axes, axis_size=self.num_objects)
-            model, per_object = give(model, inputs), True
-        return replace_fields(self, object_model=model, per_object=per_object)
+        """The model whose objects all have the inputs u_t."""
+        give = partial(with_inputs, inputs=inputs)
+        if self.per_object:
+            give = eqx.filter_vmap(give, in_axes=eqx.if_array(0), axis_size=self.num_objects)
+        return replace_fields(self, object_model=give(self.object_model))
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """x_0 of every object, independent: every leaf (n, J, ...)."""

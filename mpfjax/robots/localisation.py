@@ -52,8 +52,8 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
     """
 
     grid: OccupancyGrid
-    motion: Any
-    sensor: Any
+    motion: Annotated[Any, _MOTION]
+    sensor: Annotated[Any, _SENSOR]
     starts: Float[Array, "cells 2"]
     clearance: NotNegative = eqx.field(static=True)
     initial_pose: Annotated[Float[Array, "3"], POSE] | None
@@ -69,8 +69,6 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
         inputs: PyTree = None,
     ) -> None:  # fmt: skip
         check(OccupancyGrid, grid=grid)
-        _MOTION.check(motion, "motion")
-        _SENSOR.check(sensor, "sensor")
         self.grid, self.motion, self.sensor, self.clearance = grid, motion, sensor, clearance
         self.initial_pose = to_array("initial_pose")(initial_pose)
         self.initial_deviations = to_array("initial_deviations")(initial_deviations)

@@ -22,7 +22,8 @@ Beams = Float[Array, "n b"]
 Cells = Shaped[Array, "rows columns"]
 
 _UNKNOWN = 205  # the grey that map savers write for unknown cells
-_NEGATED = {"0": False, "false": False, "no": False, "1": True, "true": True, "yes": True}
+_TRUE = ("1", "true", "yes")
+_CHOICES = {"mode": ("trinary", "scale"), "negate": ("0", "false", "no", *_TRUE)}
 
 
 class OccupancyGrid(Fitting):
@@ -181,16 +182,14 @@ def ends_of(poses: Poses, angles: Angles, ranges: Float[Array, "#n b"]) -> Float
 
 
 @checked
-def read_map(
-    path: str | Path, *, resolution: Positive | None = None, origin: tuple[float, ...] = (0.0, 0.0)
-) -> OccupancyGrid:
+def read_map(path: str | Path, *, resolution: Positive | None = None) -> OccupancyGrid:
     """The map in ROS's `map.yaml`, with the image that it names, or in an image alone.
 
     A pixel of value v in 0..255, the mean of its colours, is occupied with p = (255 - v) / 255, or
     v / 255 if the file has `negate`. Its cell is occupied if p > `occupied_thresh`, free if p <
     `free_thresh`, by default .65 and .196, and unknown between and if the pixel is transparent.
-    Images of 16 bits are read as of eight. The file takes precedence over the arguments; an image
-    alone needs `resolution`, metres per pixel. `origin` is the position of its lower left corner.
+    Images of 16 bits are read as of eight. An image alone needs `resolution`, metres per pixel, and
+    its lower left corner is the origin.
 
     A `RuntimeWarning` reports a `free_thresh`, such as .25, that makes the grey free that map
     savers write for unknown cells, which happens in ROS as well. Raises `ImportError` without
@@ -201,18 +200,17 @@ def read_map(
     from mpfjax.vision.files.frames import read_image
 
     entries: dict[str, Any] = {
-        "image": path, "mode": "trinary", "resolution": resolution, "origin": origin,
+        "image": path, "mode": "trinary", "resolution": resolution, "origin": (0.0, 0.0),
         "negate": False, "occupied_thresh": 0.65, "free_thresh": 0.196,
     }  # fmt: skip
     if Path(path).suffix in (".yaml", ".yml"):
         entries |= optional("yaml", "pyyaml").safe_load(Path(path).read_text("utf-8"))
-    if entries["mode"] not in ("trinary", "scale"):
-        raise ValueError(f"mode: {entries['mode']!r} of {path} is neither trinary nor scale")
+    for name, choices in _CHOICES.items():
+        if str(entries[name]).lower() not in choices:
+            raise ValueError(f"{name}: {entries[name]!r} of {path} is none of {', '.join(choices)}")
     if entries["resolution"] is None:
         raise ValueError(f"resolution: {path} does not say the side of a pixel in metres")
-    negated = _NEGATED.get(str(entries["negate"]).lower())
-    if negated is None:
-        raise ValueError(f"negate: {entries['negate']!r} of {path} is neither 0 nor 1")
+    negated = str(entries["negate"]).lower() in _TRUE
     side, walls_from, free_to = (
         _number(name, entries[name], path)
         for name in ("resolution", "occupied_thresh", "free_thresh")

@@ -1,11 +1,11 @@
 """Odometry: steps between poses, their noise, and poses at other times."""
 
-from typing import Annotated, Any, overload
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from mpfjax.arrays import NOT_NEGATIVE, Fitting, to_array, to_rows
 from mpfjax.checks import NotNegative, checked
@@ -58,16 +58,6 @@ class OdometryMotion(Fitting):
         x, y, heading = poses.T
         x, y = x + far * jnp.cos(heading + first), y + far * jnp.sin(heading + first)
         return jnp.stack([x, y, wrap(heading + first + second)], axis=1)
-
-
-@overload
-def odometry_steps(poses: Any) -> Float[np.ndarray, "t 3"]: ...
-
-
-@overload
-def odometry_steps(
-    poses: Any, min_distance: float, min_turn: float
-) -> tuple[Float[np.ndarray, "s 3"], Int[np.ndarray, " s"]]: ...
 
 
 @checked

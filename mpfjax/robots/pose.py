@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from mpfjax.checks import InnerShare, Positive, checked
+from mpfjax.checks import Positive, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.random import split
@@ -16,6 +16,7 @@ from mpfjax.robots.motion import wrap
 
 _MOST_ODDS = 10.0  # in logarithms: twice the alarm's, so that doubt ends as soon as it may
 _LEAST_WEIGHT = 1e-3  # of a hypothesis that is reported
+_LOG_CARRIED = np.log(1e-3)  # of the probability that a robot is carried away between two scans
 
 
 class PoseEstimate(NamedTuple):
@@ -56,22 +57,19 @@ def _near(mixture: ParticleMixture, radius: Any) -> Array:
     return jnp.hypot(away[:, 0], away[:, 1]) < radius
 
 
-@checked
-def lost(
-    localised: Any, log_evidence_against_start: Any, probability: InnerShare = 1e-3
-) -> Float[np.ndarray, "*runs t"]:
+def lost(localised: Any, log_evidence_against_start: Any) -> Float[np.ndarray, "*runs t"]:
     """The probability that the robot is not at the heaviest hypothesis, at each step.
 
         lost_t = 1 - localised_t (1 - q_t),   q_t / (1 - q_t) = o_t,
-        o_t = (o_{t-1} + p) p(y_t | x ~ p_0) / p(y_t | y_1..y_{t-1}),   o_0 = p
+        o_t = (o_{t-1} + p) p(y_t | x ~ p_0) / p(y_t | y_1..y_{t-1}),   o_0 = p = .001
 
     q is the probability that all hypotheses are wrong, from the evidence that the alarm evaluates,
-    for a change at an unknown time (Shiryaev 1963); its odds are at most e^10.
+    for a change at an unknown time (Shiryaev 1963), where a robot is carried away between two scans
+    with probability p; its odds are at most e^10.
 
     - `localised`: the probability at the heaviest hypothesis, (t,) or (runs, t), see `localised`.
     - `log_evidence_against_start`: from the run, or from the report of each step, of a filter with
       an alarm or restarts, of the same shape.
-    - `probability`: p, that a robot is carried away between two scans.
 
     Use it to stop a robot, or to let it explore: below .5 the pose is probably correct. Raises
     `ValueError` for arrays of different shapes.
@@ -80,17 +78,16 @@ def lost(
     if not shares.ndim or shares.shape != evidences.shape:
         shapes = f"{shares.shape} and {evidences.shape}"
         raise ValueError(f"localised, log_evidence_against_start: {shapes} are not (t,) both")
-    log_odds, doubts = np.full(shares.shape[:-1], np.log(probability)), []
+    log_odds, doubts = np.full(shares.shape[:-1], _LOG_CARRIED), []
     for evidence in np.moveaxis(evidences, -1, 0):
-        log_odds = _next_log_odds(log_odds, evidence, probability)
+        log_odds = _next_log_odds(log_odds, evidence)
         doubts.append(log_odds)
     return 1 - np.minimum(shares, 1.0) / (1 + np.exp(np.stack(doubts, axis=-1)))
 
 
-def _next_log_odds(log_odds: Any, evidence: Any, probability: float) -> Any:
-    evidence = np.where(np.isnan(evidence), 0.0, evidence)
-    log_odds = np.logaddexp(log_odds, np.log(probability)) + evidence
-    return np.clip(log_odds, np.log(probability) - _MOST_ODDS, _MOST_ODDS)
+def _next_log_odds(log_odds: Any, evidence: Any) -> Any:
+    log_odds = np.logaddexp(log_odds, _LOG_CARRIED) + np.where(np.isnan(evidence), 0.0, evidence)
+    return np.clip(log_odds, _LOG_CARRIED - _MOST_ODDS, _MOST_ODDS)
 
 
 @eqx.filter_jit
@@ -117,7 +114,6 @@ def follow(
     scans: Iterable[tuple[Any, Any]],
     *,
     radius: Positive = 1.0,
-    probability: InnerShare = 1e-3,
 ) -> Iterator[PoseEstimate]:
     """The pose of the robot after each scan, as the scans arrive.
 
@@ -128,19 +124,12 @@ def follow(
     - `scans`: pairs (step, scan) in order, of any length: the odometry since the previous pair, and
       y_t. They are read one by one.
     - `radius`: of what counts as the same position, metres; see `localised`.
-    - `probability`: p of `lost`.
 
     Raises `ValueError` at the first scan for a filter without an alarm. Use it in a robot: the
     program is compiled in the first steps, and all later ones take the same time, except for
     restarts.
     """
-    return _follow(key, filter, scans, radius, probability)
-
-
-def _follow(
-    key: Any, filter: Filter, scans: Iterable[tuple[Any, Any]], radius: float, probability: float
-) -> Iterator[PoseEstimate]:
-    mixture, log_odds = None, np.log(probability)
+    mixture, log_odds = None, _LOG_CARRIED
     for step, scan in scans:
         key, key_init, key_step = split(key, 3)
         if mixture is None:
@@ -149,7 +138,7 @@ def _follow(
         evidence = info.log_evidence_against_start
         if evidence is None:
             raise ValueError("filter: it has no alarm; write with_alarm(filter, 1000)")
-        log_odds = _next_log_odds(log_odds, float(evidence), probability)
+        log_odds = _next_log_odds(log_odds, float(evidence))
         summary = _summary(mixture, jnp.asarray(radius))
         pose, covariance, share, means, weights = map(np.asarray, summary)
         order = np.argsort(-weights)

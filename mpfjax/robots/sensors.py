@@ -97,10 +97,8 @@ class AbstractLaser(Fitting):
         total = jnp.sum(jnp.where(is_used[None], logs, 0.0), axis=1)
         if self.exponent is not None:
             return self.exponent * total
-        return (
-            jnp.minimum(1.0, _INDEPENDENT / jnp.maximum(jnp.sum(is_used).astype(total.dtype), 1.0))
-            * total
-        )
+        number = jnp.maximum(jnp.sum(is_used).astype(total.dtype), 1.0)
+        return jnp.minimum(1.0, _INDEPENDENT / number) * total
 
     def _space_out(self, usable: Bool[Array, " k"], *values: Array) -> list[Array]:
         """The values of at most `max_beams` usable beams, evenly spaced, and which are any."""

@@ -92,7 +92,7 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     _, past = jax.lax.scan(back, (end.latent, nothing), steps, reverse=True)
     latents, futures, indices = append_last(past, (end.latent, nothing, last))
     following = jax.tree.map(lambda leaf: leaf[1:], latents)
-    start = linear.with_moments(model, jax.tree.map(lambda leaf: leaf[0], latents))
+    start = law_of(model).start(jax.tree.map(lambda leaf: leaf[0], latents))
     _, later = jax.lax.scan(forth, start, (following, observations, inputs))
     filtered = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows]), start, later)
     smoothed = jax.vmap(_smoothed)(filtered, futures)

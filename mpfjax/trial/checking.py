@@ -22,7 +22,7 @@ from mpfjax.models.base import (
     require_noise,
     with_inputs,
 )
-from mpfjax.models.conditionally_linear import is_mixed, with_moments
+from mpfjax.models.conditionally_linear import is_mixed
 from mpfjax.models.law import law_of
 from mpfjax.models.observations import one_input, one_observation
 from mpfjax.models.targets import TargetsModel, UniformBirth
@@ -126,7 +126,7 @@ def _draw(key, model, now):
     keys = jax.random.split(key, 6)
     drawn: dict[str, PyTree] = {"many x_0": _of_many_keys(_initial, keys[0], model, _DRAWS)}
     law, draws = law_of(now), model.sample_initial(keys[1], _DENSITY_DRAWS)
-    initial = with_moments(model, draws)
+    initial = law.start(draws)
     if callable(getattr(model, "log_initial", None)):
         drawn["x_0"], drawn["log_initial"] = draws, law_of(model).log_initial(draws)
     starts = _rows(initial, slice(_FAMILIES))
@@ -165,9 +165,7 @@ def _draw(key, model, now):
 
 
 def _initial(key: Key[Array, ""], model: Any, number: int) -> PyTree:
-    drawn = model.sample_initial(key, number)
-    check_states(drawn, model, "sample_initial", number)
-    return with_moments(model, drawn)
+    return law_of(model).sample_initial(key, number)
 
 
 def _move(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:

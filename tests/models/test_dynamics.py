@@ -36,7 +36,7 @@ CASES = {
         CURRENT + 0.5 * (CURRENT - PREVIOUS),
         SMALL,
     ),
-    "velocity": (WalkWithVelocity(JUMPS, (0.2, 0.0)), 2 * CURRENT - PREVIOUS, BOTH),
+    "velocity": (WalkWithVelocity(JUMPS, (0.2, 0.0), [0.0, 0.0]), 2 * CURRENT - PREVIOUS, BOTH),
 }  # fmt: skip
 
 
@@ -95,7 +95,7 @@ def test_a_path_has_the_density_of_a_random_walk_velocity_seen_in_noise(gain):
     """
     places = np.cumsum(np.random.default_rng(0).normal(0.4, 0.6, 13))
     velocity, S, t = 0.7, 0.5**2, np.arange(12)
-    dynamics = WalkWithVelocity(RandomWalk([0.5]), gain)
+    dynamics = WalkWithVelocity(RandomWalk([0.5]), gain, [0.0])
     found, past = 0.0, jnp.full((1, 1), places[0] - velocity)
     for before, now in itertools.pairwise(places):
         before, now = jnp.full((1, 1), before), jnp.full((1, 1), now)

@@ -452,15 +452,6 @@ def test_the_number_is_that_of_independent_events():
 
 
 @pytest.mark.exactness
-def test_quantiles_are_those_of_each_object():
-    states = np.stack([np.linspace(0, 1, 101), np.linspace(5, 7, 101)])[..., None]
-    filter = Filter(model(), [Predict(), Associate(undetected_particles=10)], 212, 3)
-    found = mpfjax.estimate_targets(bernoulli_mixture(filter, states, [0.5, 0.25]), q=(0.1, 0.5))
-    np.testing.assert_allclose(found.quantiles[..., 0], [[0.1, 0.5], [5.2, 6.0]], atol=0.03)
-    np.testing.assert_allclose(found.existence, [0.5, 0.25], atol=1e-6)
-
-
-@pytest.mark.exactness
 @pytest.mark.parametrize("region", [mpfjax.Box([-1, 0], [2, 1]), mpfjax.Disc([0.5, 0], 0.8)])
 def test_new_objects_are_even_in_a_region(region):
     """The importance weights at a measurement integrate the same density as draws anywhere."""

@@ -25,13 +25,13 @@ def test_localised_is_the_mass_near_the_heaviest_component():
 def test_lost_is_the_probability_of_a_change():
     """Beside the sum over all times at which the robot may have been carried away."""
     rng = np.random.default_rng(0)
-    evidences, shares, p = rng.normal(size=6), rng.uniform(size=6), 0.02
-    lost = robots.lost(shares, evidences, p)
+    evidences, shares, p = 2 * rng.normal(size=6), rng.uniform(size=6), 1e-3
+    lost = robots.lost(shares, evidences)
     for t in range(6):
         # At the start, or before any scan since.
         odds = sum(p * np.exp(evidences[k : t + 1].sum()) for k in (0, *range(t + 1)))
         assert lost[t] == pytest.approx(1 - shares[t] / (1 + odds))
-    both = robots.lost(np.stack([shares, shares]), np.stack([evidences, evidences]), p)
+    both = robots.lost(np.stack([shares, shares]), np.stack([evidences, evidences]))
     assert both == pytest.approx(np.stack([lost, lost]))
     with pytest.raises(ValueError, match="localised, log_evidence_against_start"):
         robots.lost(shares[1:], evidences)

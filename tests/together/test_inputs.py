@@ -154,20 +154,13 @@ class Drawn(mpfjax.AbstractStateSpaceModel):
         return norm.logpdf(observation, states - self.inputs, 1.0)
 
 
-@pytest.mark.parametrize(("per_object", "shared"), [(True, False), (True, True), (False, False)])
-def test_objects_have_one_input_or_their_own(per_object, shared):
-    shift = jnp.array([1.0, 2.0, 3.0]) if per_object else jnp.array(1.0)
-    model = mpfjax.MultiObjectModel(
-        Drawn(shift), 3, shared_observation=True, per_object=per_object, shared_inputs=shared
-    )
-    inputs = jnp.array(10.0) if shared else jnp.array([10.0, 20.0, 30.0])
+@pytest.mark.parametrize("shift", [jnp.array(1.0), jnp.array([1.0, 2.0, 3.0])])
+def test_all_objects_have_the_input(shift):
+    model = mpfjax.MultiObjectModel(Drawn(shift), 3, shared_observation=True)
     states = model.sample_initial(KEY, 16)
-    moved = model.with_inputs(inputs).sample_transition(KEY, states)
-    expected = jnp.broadcast_to(shift + inputs, (3,))
+    moved = model.with_inputs(jnp.array(10.0)).sample_transition(KEY, states)
+    expected = jnp.broadcast_to(shift + 10.0, (3,))
     np.testing.assert_allclose(moved.mean(axis=0), expected, atol=0.02)
-    if not shared:
-        with pytest.raises(ValueError, match=r"inputs: shape \(\) has no leading axis of 3 obj"):
-            model.with_inputs(jnp.array(10.0))
 
 
 FILTER = mpfjax.particle_filter(Driven(), 32)

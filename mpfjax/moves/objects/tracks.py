@@ -1,6 +1,5 @@
 """Summaries of a filter of an unknown number of objects: tracks, and the number of objects."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +22,6 @@ class TargetEstimates(NamedTuple):
     - `existence`: the existence probability, zero if there is no object.
     - `means`, `covariances`: of its state; in the form of the state, NaN if there is none, and (M,
       d, d) for the flattened state.
-    - `quantiles`: of each component of the flattened state, (M, q, d); None unless requested.
     - `number`: the median of the number of objects, which minimises the mean absolute error.
     - `expected_number`: of all objects, of which `undetected` have not been revealed yet.
     - `crowded_out`: the expected number of objects for which there was no component in this step.
@@ -33,41 +31,28 @@ class TargetEstimates(NamedTuple):
     existence: Float[Array, " m"]
     means: PyTree
     covariances: Float[Array, "m d d"]
-    quantiles: Float[Array, "m q d"] | None
     number: Int[Array, ""]
     expected_number: Float[Array, ""]
     undetected: Float[Array, ""]
     crowded_out: Float[Array, ""]
 
 
-def estimate_targets(mixture: ParticleMixture, q: Sequence[float] = ()) -> TargetEstimates:
+def estimate_targets(mixture: ParticleMixture) -> TargetEstimates:
     """The objects of a `bernoulli_filter`, for `collect=estimate_targets` or one mixture.
-
-    - `q`: the quantiles to compute, such as (0.05, 0.95), which require a sort for each component.
 
     Raises `ValueError` for a mixture of another filter. Use it with `number_distribution`, and with
     `track_table` for a table of a whole run.
     """
     if TARGETS not in mixture.memory:
         raise ValueError("mixture: it is not from a bernoulli_filter")
-    memory, values = mixture.memory[TARGETS], flatten_states(mixture.particles)
+    memory = mixture.memory[TARGETS]
     existence = memory["number"] * mixture.mixture_weights
     of_each = jnp.minimum(existence[1:], 1.0)
-
-    def of_component(m: Int[Array, ""]) -> Float[Array, "q d"]:
-        is_own = mixture.component_indicators == m
-        log_weights = jnp.where(is_own, mixture.log_weights, -jnp.inf)
-        log_weights -= mixture.log_mixture_weights[m]
-        return mixture.replace(log_weights=log_weights).quantile(values, q)
-
-    places = jnp.arange(1, mixture.num_components, dtype=jnp.int32)
-    means = jax.tree.map(lambda leaf: leaf[1:], mixture.component_means())
     return TargetEstimates(
         labels=memory["labels"][1:],
         existence=of_each,
-        means=means,
+        means=jax.tree.map(lambda leaf: leaf[1:], mixture.component_means()),
         covariances=mixture.component_covariances()[1:],
-        quantiles=jax.vmap(of_component)(places) if len(q) else None,
         number=jnp.sum(jnp.cumsum(number_distribution(of_each)) < 0.5),
         expected_number=memory["number"],
         undetected=existence[0],

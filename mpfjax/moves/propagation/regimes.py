@@ -10,12 +10,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.checks import check
 from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import require
-from mpfjax.models.conditionally_linear import (
-    AbstractConditionallyLinearModel,
-    log_predictive,
-    predict,
-    update,
-)
+from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
+from mpfjax.models.law import Law
 from mpfjax.moves.base import AbstractPropagation, AbstractProposal, Step, is_missing
 from mpfjax.moves.regrouping.partitions import GroupBy
 from mpfjax.moves.resampling.ancestors import draw_ancestors
@@ -118,18 +114,17 @@ class PropagateRegimes(AbstractPropagation):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate, and weigh by y_t where it is there."""
-        model = now.model
         if is_missing(now):
-            pairs = model.all_transitions(mixture.particles.latent)
+            pairs = now.model.all_transitions(mixture.particles.latent)
             family = self._family(mixture, [latent for latent, _ in pairs])
             log_priors = jnp.concatenate([log for _, log in pairs])
             family = family.replace(log_weights=family.log_weights + log_priors)
-            return self._select_children(key, mixture, family, model)
+            return self._select_children(key, mixture, family, now.law)
         mixture = mixture.with_resampled(mixture.active)
         latents, _, log_factors = children(now, mixture.particles)
         family = self._family(mixture, latents).reweight(log_factors.reshape(-1))
-        moved = self._select_children(key, mixture, family, model)
-        return moved.replace(particles=update(model, now.observation, moved.particles)[0])
+        moved = self._select_children(key, mixture, family, now.law)
+        return moved.replace(particles=now.law.see(now.observation, moved.particles)[0])
 
     def _family(self, mixture: ParticleMixture, latents: list[PyTree]) -> ParticleMixture:
         """All children, those of a regime side by side, with their parents' weights and moments.
@@ -142,7 +137,7 @@ class PropagateRegimes(AbstractPropagation):
         return family.replace(particles=family.particles._replace(latent=latent), memory={})
 
     def _select_children(
-        self, key: Key[Array, ""], mixture: ParticleMixture, family: ParticleMixture, model: Any
+        self, key: Key[Array, ""], mixture: ParticleMixture, family: ParticleMixture, law: Law
     ) -> ParticleMixture:
         """N of the N K children, their moments predicted."""
         if self.regroup is not None:
@@ -169,7 +164,7 @@ class PropagateRegimes(AbstractPropagation):
         gain = jax.lax.stop_gradient(jnp.maximum(log_least - log_weights, 0.0))
         selection = family.at(places)
         return selection.replace(
-            particles=predict(model, selection.particles.latent, selection.particles),
+            particles=law.complete(selection.particles.latent, selection.particles),
             log_weights=jnp.where(slots.filled, log_weights + gain, -jnp.inf),
             component_indicators=slots.components,
             memory=mixture.memory,
@@ -186,10 +181,11 @@ def children(
     now: Step, state: MarginalisedState
 ) -> tuple[list[PyTree], Float[Array, "k n"], Float[Array, "k n"]]:
     """The K latents that may follow each particle, log p(z_t | z_{t-1}), and that times p(y_t)."""
-    model = now.model
-    pairs = model.all_transitions(state.latent)
+    law, pairs = now.law, now.model.all_transitions(state.latent)
     latents, log_priors = [latent for latent, _ in pairs], jnp.stack([log for _, log in pairs])
-    log_densities = [log_predictive(model, now.observation, latent, state) for latent in latents]
+    log_densities = [
+        law.log_likelihood(now.observation, law.complete(latent, state)) for latent in latents
+    ]
     return latents, log_priors, log_priors + jnp.stack(log_densities)
 
 
