@@ -18,6 +18,7 @@ def test_distances_are_from_the_edges_of_blocks():
     """Deep inside a block a beam has met nothing."""
     grid = robots.OccupancyGrid(SOLID, resolution=0.1)
     distances = np.asarray(grid.distances)
+    assert not robots.OccupancyGrid(SOLID, SOLID, resolution=0.1).free.any()
     assert distances[30, 30] == pytest.approx(0.9)
     assert distances[20, 30] == 0
     assert distances[10, 30] == pytest.approx(1.0)
