@@ -16,7 +16,6 @@ from mpfjax.running.storage import (
     arrays_of,
     describe_parts,
     differences,
-    program_of,
     read_described,
     tree_of_arrays,
     write_described,
@@ -30,16 +29,15 @@ class Checkpoint(Checked):
       result of an uninterrupted run, to the bit. The call may ask for more steps or observations.
     - `every`: after how many steps it is written. It is also written when the run ends, fails or is
       interrupted. If the writing itself is interrupted, the old file remains.
-    - `name`: a name of the run, such as "adam, cosine". Its file is then recognised by this name
-      and by the data and numbers of the call, and no longer by the program that JAX makes of the
-      functions, such as a prior or an optimiser, which another version of JAX may change.
+
+    A file of a run with another filter, other data or other numbers is refused. The code of
+    functions, such as a prior or an optimiser, is not compared: use a new file after you change it.
 
     Raises `ValueError` for an `every` below one.
     """
 
     path: str | os.PathLike[str]
     every: Count = 50
-    name: str | None = None
 
 
 class State(NamedTuple):
@@ -131,20 +129,15 @@ class LongRun:
 
 
 def identity_of(
-    caller: str, checkpoint: Checkpoint | None, settings: dict[str, Any], functions: dict[str, Any]
+    caller: str, checkpoint: Checkpoint | None, settings: dict[str, Any]
 ) -> dict[str, str]:
     """All that has to be the same for a file to belong to this run, as text.
 
-    `settings` are numbers, arrays, modules and names, and always compared. `functions` are each a
-    function with arguments to trace it by; in their place stands a name that the user gave.
+    `settings` are numbers, arrays, modules and names. The code of functions is not compared.
     """
     if checkpoint is None:
         return {}
-    texts = {"caller": caller} | describe_parts(**settings)
-    if checkpoint.name is not None:
-        return texts | {"name": checkpoint.name}
-    programs = {part: program_of(*call) for part, call in functions.items() if call[0] is not None}
-    return texts | programs
+    return {"caller": caller} | describe_parts(**settings)
 
 
 def _concatenate(pieces: list[PyTree]) -> PyTree:

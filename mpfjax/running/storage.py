@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -137,25 +137,6 @@ def fingerprint(tree: PyTree) -> str:
     for leaf in filter(is_data, jax.tree.leaves(tree)):
         digest.update(as_numpy(leaf).tobytes())
     return digest.hexdigest()
-
-
-def program_of(function: Callable[..., Any], *arguments: Any) -> str:
-    """A fingerprint of what JAX traces of a function: that of all that do the same.
-
-    It tells apart functions of other code, and those that hold other numbers.
-    """
-    program, *_ = eqx.filter_make_jaxpr(function)(*arguments)
-    return fingerprint((stable_name(program.jaxpr), list(_constants(program))))[:12]
-
-
-def _constants(program: Any) -> Iterator[Any]:
-    """All arrays that a program of JAX holds, those of programs within it as well."""
-    yield from getattr(program, "consts", ())
-    inner = getattr(program, "jaxpr", program)
-    for equation in inner.eqns:
-        for value in jax.tree.leaves(list(equation.params.values())):
-            if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
-                yield from _constants(value)
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:

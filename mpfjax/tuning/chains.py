@@ -135,17 +135,17 @@ class Sampling(Checked):
             raise ValueError(f"thinning: {self.thinning} is more than num_steps, {self.num_steps}")
 
     def run(
-        self, kernel: AbstractKernel, settings: dict[str, Any], functions: dict[str, Any]
+        self, kernel: AbstractKernel, settings: dict[str, Any]
     ) -> tuple[list[PyTree], dict[str, Any]]:
         """What reports hold beside the parameters, leaves (chains, draws, ...), and other fields.
 
-        The last two arguments are those of `identity_of`.
+        `settings` are those of `identity_of`.
         """
         settings = self.problem.settings | settings | {
             "proposal_deviations": self.deviations, "key": self.key, "burn_in": self.burn_in,
             "num_chains": self.num_chains, "thinning": self.thinning,
         }  # fmt: skip
-        identity = identity_of(self.caller, self.checkpoint, settings, functions)
+        identity = identity_of(self.caller, self.checkpoint, settings)
         num_draws = self.num_steps // self.thinning
         last = self.burn_in + num_draws * self.thinning
         run = LongRun(self.caller, last, self.checkpoint, self.progress, lambda step: identity)

@@ -142,12 +142,10 @@ def particle_gibbs(
             require(filter.model, density, "particle_gibbs with log_prior")
         prior = checked_prior(log_prior, problem, key, sample_prior)
     kernel = _Kernel(problem, prior, draw, collect, backward)
-    start, trajectory = problem.start(), shape_of_trajectory(filter.model, series.length + 1)
-    functions = {"log_prior": (prior, start), "collect": (collect, trajectory)}
     if draw is not None:  # Names and shapes are checked before anything compiles.
-        jax.eval_shape(kernel.drawn, key, start, trajectory)
-        functions["draw"] = (kernel.drawn, key, start, trajectory)
-    (paths, accepted, renewed), fields = sampling.run(kernel, {"observations": series}, functions)
+        trajectory = shape_of_trajectory(filter.model, series.length + 1)
+        jax.eval_shape(kernel.drawn, key, problem.start(), trajectory)
+    (paths, accepted, renewed), fields = sampling.run(kernel, {"observations": series})
     return GibbsPosterior(trajectories=paths, accepted=accepted, renewed=renewed, **fields)
 
 

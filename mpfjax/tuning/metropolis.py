@@ -102,8 +102,7 @@ def metropolis_hastings(
     prior = checked_prior(log_prior, problem, key, sample_prior)
     density = LogDensity(problem, prior)
     data = {"observations": problem.objective}
-    functions = {"log_prior": (prior, problem.start())}
-    (values, accepted, key_data), fields = sampling.run(_Kernel(density), data, functions)
+    (values, accepted, key_data), fields = sampling.run(_Kernel(density), data)
     return Posterior(
         log_marginal_likelihoods=values, accepted=accepted, key_data=key_data, **fields
     )

@@ -142,7 +142,7 @@ def fit(
         "fit", "log marginal likelihood", key, problem, optimizer, num_seeds, batch, pooled
     )
     data = {"observations": problem.objective, "score": score}
-    reals, values, run = ascent.climb(num_steps, checkpoint, progress, data, {})
+    reals, values, run = ascent.climb(num_steps, checkpoint, progress, data)
     if pooled:
         _warn_of_few_seeds(run[3]["effective_seeds"], values)
     effective, errors = None, None
@@ -200,16 +200,14 @@ def maximise(
     - `parameters`: as for `fit`, selected from `model`; None is every floating-point array of it.
 
     Raises errors as `fit` does for the same arguments, and `ValueError` for an objective that is
-    not a floating-point scalar. For a `checkpoint` the objective must also be the same.
+    not a floating-point scalar.
     """
     problem = pose(model, objective, parameters, transforms)
     ascent = _Ascent("maximise", "value", key, problem, optimizer, num_seeds)
     value = eqx.filter_eval_shape(objective, key, problem.at(problem.start()))
     if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(f"objective: it returns {shown(value)}, no floating point scalar")
-    functions = {"objective": (problem.value, key, problem.start())}
-    data = {"objective": objective}
-    _, _, run = ascent.climb(num_steps, checkpoint, progress, data, functions)
+    _, _, run = ascent.climb(num_steps, checkpoint, progress, {"objective": objective})
     del run[3]["effective_seeds"]  # of values that are no logarithms of likelihoods
     return TuningRun(*run)
 
@@ -233,7 +231,6 @@ class _Ascent:
         checkpoint: Checkpoint | None,
         progress: bool,
         data: dict[str, Any],
-        functions: dict[str, Any],
     ) -> tuple[Reals, Float[np.ndarray, "seeds series"] | None, tuple]:
         """The parameters at the end, the objective there, and the first fields of a `TuningRun`."""
         reals = self.problem.start()
@@ -242,12 +239,7 @@ class _Ascent:
         start = State(0, (reals, optimizer), (np.empty(0), np.empty(0), np.empty(0), no_path))
         settings = {"key": self.key, "num_seeds": int(self.num_seeds)}
         settings |= {"batch": self.batch, "pooled": self.pooled} | self.problem.settings | data
-
-        def first(reals: Reals) -> Any:
-            return self._update(reals, self.optimizer.init(reals), reals)
-
-        functions |= {"optimizer": (first, reals)}
-        identity = identity_of(self.caller, checkpoint, settings, functions)
+        identity = identity_of(self.caller, checkpoint, settings)
         run = LongRun(self.caller, num_steps, checkpoint, progress, lambda step: identity)
         state, stopped = run.go(start, self._advance)
         (reals, _), (averages, deviations, effective, path) = state.carry, state.rows

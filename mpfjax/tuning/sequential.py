@@ -209,14 +209,13 @@ def smc2(
     problem = pose_evidence(filter, series, parameters, transforms)
     key_prior, key_filters, key_steps = jax.random.split(key, 3)
     reals = drawn(key_prior, problem, sample_prior, num_samples)
-    first = jax.tree.map(lambda u: u[0], reals)
     prior = checked_prior(log_prior, problem, key_prior, sample_prior)
     sampler = Sampler(problem, _pad(series, series.length), prior, int(num_moves))
     settings = problem.settings | {
         "key": key, "num_samples": int(num_samples), "num_moves": int(num_moves),
         "max_particles": max_particles,
     }  # fmt: skip
-    identity = identity_of("smc2", checkpoint, settings, {"log_prior": (prior, first)})
+    identity = identity_of("smc2", checkpoint, settings)
     run = _Run(sampler, series, key_steps, max_particles, checkpoint, progress, identity)
     samples = start(jax.random.split(key_filters, num_samples), sampler, reals)
     num_invalid = {"log_prior": 0, "log_marginal_likelihood": 0}
@@ -269,7 +268,7 @@ class _Run:
         def identity(step: int) -> dict[str, str]:
             before = jax.tree.map(lambda leaf: leaf[:step], self.series)
             data = {"observations": with_present(before)}
-            return self.identity | identity_of("smc2", self.checkpoint, data, {})
+            return self.identity | identity_of("smc2", self.checkpoint, data)
 
         run = LongRun("smc2", self.series.length, self.checkpoint, self.progress, identity)
         state, stopped = run.go(start, self._advance)

@@ -214,7 +214,7 @@ class TestLongRuns:
     def go(self, path, last, stop=None, error=None, every=3, **settings):
         """The rows and what stopped it; `error` comes where a step beyond `stop` is asked for."""
         checkpoint = None if path is None else Checkpoint(path, every)
-        identity = identity_of("adding", checkpoint, {"start": 0} | settings, {})
+        identity = identity_of("adding", checkpoint, {"start": 0} | settings)
         run = LongRun("adding", last, checkpoint, False, lambda step: identity)
 
         start = State(0, np.array(0), np.zeros(0, int))

@@ -145,7 +145,6 @@ def test_interrupted_anywhere_the_draws_are_those_of_one_run(tmp_path, monkeypat
     [
         ({"thinning": 1}, "thinning is 2 there and 1 here"),
         ({"num_chains": 3}, "num_chains is .* there and 3 here"),
-        ({"log_prior": lambda p: correlated(p) + p["a"]}, "log_prior is"),
     ],
 )
 def test_a_file_of_other_chains_is_refused(other, named, tmp_path):

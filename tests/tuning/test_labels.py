@@ -122,15 +122,12 @@ def test_a_function_is_an_objective():
 
 @pytest.mark.parametrize("wrap", [lambda function: function, eqx.filter_jit])
 def test_it_goes_on_from_a_checkpoint_of_the_same_objective(tmp_path, wrap):
-    def part(num_steps, aim):
-        data = jnp.array([aim, 0.0])
-        objective = wrap(lambda key, model: -((model.lambda_ - data[0]) ** 2))
+    def part(num_steps):
+        objective = wrap(lambda key, model: -((model.lambda_ - 3.0) ** 2))
         checkpoint = mpfjax.Checkpoint(tmp_path / "ascent.npz")
         return ascent(objective, num_steps, checkpoint=checkpoint)
 
-    part(3, 3.0)
+    part(3)
     np.testing.assert_array_equal(
-        part(6, 3.0).parameters["lambda"], ascent(num_steps=6).parameters["lambda"]
+        part(6).parameters["lambda"], ascent(num_steps=6).parameters["lambda"]
     )
-    with pytest.raises(ValueError, match=r"is of another maximise: objective.* is"):
-        part(7, 4.0)
