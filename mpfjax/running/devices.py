@@ -1,9 +1,9 @@
-"""Runs distributed over devices, of this process or of all, and over threads of a CPU."""
+"""Runs distributed over the devices of this process, and over threads of a CPU."""
 
 import functools
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -13,40 +13,20 @@ import jax.core
 import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors
 from mpfjax.operations.islands import DEVICE_AXIS
-from mpfjax.running.storage import fingerprint, is_key
 
 
-def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
-    """The devices to use: all, the first few, or those given.
-
-    None is every device of every process, or JAX's default device if one is set. Raises
-    `ValueError` for more devices than there are, none at all, a device twice, and, under several
-    processes, for devices that leave a process out.
-    """
-    available = jax.devices()
-    if devices is None:
-        default = getattr(jax.config, "jax_default_device", None)
-        if default is None:
-            chosen = available
-        else:
-            chosen = jax.devices(default) if isinstance(default, str) else [default]
-    else:
-        is_number = isinstance(devices, int)
-        chosen = available[: max(devices, 0)] if is_number else list(devices)
-        distinct = {device for device in chosen if isinstance(device, jax.Device)}
-        if not chosen or len(distinct) != (devices if is_number else len(chosen)):
-            raise ValueError(f"devices: {devices} are not some of the {len(available)} devices")
-    idle = jax.process_count() - len({device.process_index for device in chosen})
-    if jax.process_count() > 1 and idle:
-        raise ValueError(f"devices: {chosen} leaves {idle} of the processes without any")
-    return chosen
+def available_devices() -> list[Any]:
+    """The devices of this process, or JAX's default device if one is set."""
+    default = getattr(jax.config, "jax_default_device", None)
+    if default is None:
+        return jax.local_devices()
+    return jax.devices(default) if isinstance(default, str) else [default]
 
 
 def over_devices(
@@ -54,36 +34,25 @@ def over_devices(
     run_on_one: Callable[..., PyTree],
     inputs: PyTree,
     arguments: tuple[PyTree, ...],
-    devices: int | Sequence[Any] | None,
-    choose: Callable[[Any], list[Any]] = choose_devices,
+    devices: list[Any],
 ) -> PyTree:
     """`run(inputs, *arguments)` with the inputs dealt to the devices in blocks of equal size.
 
-    Every leaf of the result has a leading axis k, like the inputs, and lies on the first device,
-    or on the first one of each process. If the number of devices does not divide k, the last input
-    is repeated, and the extra results are dropped. Devices exchange only what `run` makes them
-    exchange. `run_on_one` is compiled and does all runs on one device. Which devices there are is
-    left to `choose`, and in a program of the caller's, for None, to JAX.
+    Every leaf of the result has a leading axis k, like the inputs, and lies on the first device. If
+    the number of devices does not divide k, the last input is repeated, and the extra results are
+    dropped. Devices exchange only what `run` makes them exchange. `run_on_one` is compiled and does
+    all runs on one device; in a program of the caller's, which device that is is left to JAX.
     """
-    traced = is_traced((inputs, arguments))
-    chosen = [] if traced and devices is None else choose(devices)
-    if len(chosen) < 2:
-        if not traced and chosen != jax.devices()[:1]:
-            inputs, arguments = _place((inputs, arguments), chosen[0])
+    if len(devices) < 2 or is_traced((inputs, arguments)):
         return run_on_one(inputs, *arguments)
     num_inputs = length_of(inputs)
-    padding = -num_inputs % len(chosen)
+    padding = -num_inputs % len(devices)
     padded = _at(inputs, np.arange(num_inputs + padding)) if padding else inputs
-    mesh = Mesh(np.array(chosen), (DEVICE_AXIS,))
-    if not traced:
-        padded = _place(padded, NamedSharding(mesh, P(DEVICE_AXIS)))
-        arguments = _place(arguments, NamedSharding(mesh, P()))
-    result = _spread(run, padded, arguments, mesh)
-    if not traced:
-        result = _gather(result, mesh)
-    if padding:
-        result = jax.tree.map(lambda leaf: leaf[:num_inputs], result)
-    return result
+    mesh = Mesh(np.array(devices), (DEVICE_AXIS,))
+    padded = _place(padded, NamedSharding(mesh, P(DEVICE_AXIS)))
+    arguments = _place(arguments, NamedSharding(mesh, P()))
+    result = jax.device_put(_spread(run, padded, arguments, mesh), devices[0])
+    return jax.tree.map(lambda leaf: leaf[:num_inputs], result)
 
 
 def length_of(inputs: PyTree) -> int:
@@ -108,43 +77,10 @@ def _spread(run, inputs, arguments, mesh):
     return jax.shard_map(on_each, mesh=mesh, **specs, check_vma=False)(inputs, arrays)
 
 
-def _place(tree: PyTree, where: Any) -> PyTree:
-    """Every array of the tree moved to a device or sharding."""
+def _place(tree: PyTree, sharding: NamedSharding) -> PyTree:
+    """Every array of the tree moved to a sharding."""
     arrays, rest = eqx.partition(tree, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
-    if jax.process_count() == 1:
-        return eqx.combine(jax.device_put(arrays, where), rest)
-    _require_same_everywhere(arrays)
-    return eqx.combine(jax.tree.map(lambda leaf: _global(leaf, where), arrays), rest)
-
-
-def _require_same_everywhere(arrays: PyTree) -> None:
-    """Raise if the processes do not hold the same numbers; they exchange a digest only."""
-    leaves = [leaf for leaf in jax.tree.leaves(arrays) if not _is_global(leaf)]
-    digest = np.frombuffer(bytes.fromhex(fingerprint(leaves)), np.uint8)
-    if (multihost_utils.process_allgather(digest) != digest[None]).any():
-        raise ValueError("keys, filter, observations: not the same in every process")
-
-
-def _global(leaf: Any, sharding: NamedSharding) -> Array:
-    """An array over all processes, of which each holds a copy of the whole."""
-    if _is_global(leaf):
-        return leaf
-    if is_key(leaf):
-        data = _global(jax.random.key_data(leaf), sharding)
-        return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
-    values = np.asarray(jnp.asarray(leaf))
-    return jax.make_array_from_callback(values.shape, sharding, lambda index: values[index])
-
-
-def _is_global(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array) and not leaf.is_fully_addressable
-
-
-def _gather(tree: PyTree, mesh: Mesh) -> PyTree:
-    if jax.process_count() == 1:
-        return jax.device_put(tree, mesh.devices.flat[0])
-    everywhere = jax.jit(lambda tree: tree, out_shardings=NamedSharding(mesh, P()))(tree)
-    return jax.tree.map(lambda leaf: leaf.addressable_data(0), everywhere)
+    return eqx.combine(jax.device_put(arrays, sharding), rest)
 
 
 def over_threads(

@@ -4,9 +4,8 @@ If the weights of the islands have become uneven, `IslandInteraction` redistribu
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +15,7 @@ from jaxtyping import Array, Bool, Key, PyTree
 from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.series import as_series, series_of
+from mpfjax.models.series import as_series
 from mpfjax.moves.base import AbstractMove, Step, is_missing
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.islands import (
@@ -27,7 +26,7 @@ from mpfjax.operations.islands import (
     over_islands,
 )
 from mpfjax.operations.logarithms import softmax
-from mpfjax.running.devices import choose_devices, over_devices
+from mpfjax.running.devices import available_devices, over_devices
 from mpfjax.running.diagnosis import sound
 from mpfjax.running.results import FilterRun
 from mpfjax.running.scan import scan
@@ -41,9 +40,6 @@ def run_islands(
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
     num_islands: Count,
-    inputs: PyTree = None,
-    missing: Literal["error", "skip"] = "error",
-    devices: int | Sequence[Any] | None = None,
 ) -> FilterRun:
     """Run one filter of G islands, each a copy of `filter`, on many devices.
 
@@ -54,41 +50,32 @@ def run_islands(
     through the mixture weights"; Vergé et al. 2015 for islands). If the filter's marginal
     likelihood is unbiased, so is the result.
 
-    - `observations`, `inputs`, `missing`: as for `run_filter`.
+    - `observations`: arrays, or a `Series`, as for `run_filter`.
     - `filter`: the filter of one island, with its N and M. A standard particle filter makes islands
       of particles. With an `IslandInteraction` among the moves, their weights stay even.
-    - `num_islands`: G. The result depends on the key and on G, not on the devices. With another
-      number of devices it differs by rounding; if rounding changes a draw, it differs like another
-      run.
-    - `devices`: a number or a sequence of `jax.devices()`, whose number must divide G. None uses
-      the largest number of devices that divides G.
+    - `num_islands`: G. The largest number of devices that divides G shares them. The result depends
+      on the key and on G, not on the devices. With another number of devices it differs by
+      rounding; if rounding changes a draw, it differs like another run.
     - `collect(mixture)` receives one island, whose weights sum to its share. Its results are
       stacked over t and islands, (t, G, ...). The sum over islands of `expectation`, `mean` or
       `variance` is the value for the whole mixture.
 
     The result is that of `run_filter` on the whole mixture. Slots and component labels of island g
     come after those of island g - 1, ancestors may be on other islands, and only `memory` keeps a
-    leading axis of islands. Errors are those of `run_filter`. Also raises `ValueError` for G < 1,
-    and for devices that do not exist or do not divide G. Use it if one filter is too large or too
-    slow for one device. For many runs of a filter that fits on one device, use `monte_carlo`.
+    leading axis of islands. Errors are those of `run_filter`. Also raises `ValueError` for G < 1.
+    Use it if one filter is too large or too slow for one device. For many runs of a filter that
+    fits on one device, use `monte_carlo`.
     """
-    series = as_series(series_of(observations, inputs, missing), filter.model)
+    series = as_series(observations, filter.model)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
 
     def run(filter: Filter) -> FilterRun:
-        arguments, dividing = (filter, series, collect), partial(_dividing, num_islands)
-        return over_devices(_run_block, _run_on_one, keys, arguments, devices, dividing)
+        devices = available_devices()
+        most = max(d for d in range(1, len(devices) + 1) if num_islands % d == 0)
+        arguments = (filter, series, collect)
+        return over_devices(_run_block, _run_on_one, keys, arguments, devices[:most])
 
     return sound(_join(with_floats_traced(run, filter), collect is None))
-
-
-def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any]:
-    """The devices chosen; without a choice the most that deal the islands evenly."""
-    chosen = choose_devices(devices)
-    most = max(d for d in range(1, len(chosen) + 1) if num_islands % d == 0)
-    if most < len(chosen) and (devices is not None or jax.process_count() > 1):
-        raise ValueError(f"num_islands: {num_islands} cannot be split over {len(chosen)} devices")
-    return chosen[:most]
 
 
 def _run_block(keys, filter, series, collect):

@@ -1,7 +1,7 @@
 """Running a filter over observations: once, or once for each of many keys."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,12 @@ from mpfjax.memory import at_start
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.series import as_series, series_of
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
-from mpfjax.running.devices import num_processors, over_devices, over_threads
+from mpfjax.running.devices import (
+    available_devices,
+    num_processors,
+    over_devices,
+    over_threads,
+)
 from mpfjax.running.diagnosis import sound, warn_of_start
 from mpfjax.running.keys import initial_keys
 from mpfjax.running.results import FilterRun
@@ -71,20 +76,16 @@ def monte_carlo(
     *,
     inputs: PyTree = None,
     missing: Literal["error", "skip"] = "error",
-    devices: int | Sequence[Any] | None = None,
     num_slots: Count | None = None,
 ) -> FilterRun:
     """Run a filter once for each key, all on the same observations, under `vmap`.
 
     Every field of the result has a leading axis of seeds. Run k equals `run_filter(keys[k], ...)`,
-    whose arguments these are, and whose errors it raises.
+    whose arguments these are, and whose errors it raises. All devices of the process share the
+    runs, and the result is gathered on the first one; under the caller's own jit, grad or vmap one
+    device has them. On one CPU device, the runs are shared by a thread for each processor, if there
+    is enough to do.
 
-    - `devices`: the devices that share the runs. None is every device, of all processes after
-      `jax.distributed.initialize`. A number means the first few, a sequence those of
-      `jax.devices()`. The number of keys need not be a multiple of the number of devices. Devices
-      exchange nothing. The result is gathered on the first one, and each process has all of it.
-      Under the caller's own jit, grad or vmap, None is one device. On one CPU device, the runs are
-      shared by a thread for each processor, if there is enough to do.
     - `num_slots`: the length of the particle arrays, at least N; the slots after the first N stay
       empty. None is N. Filters that differ only in N compile once if they have the same
       `num_slots`: 1000, for example, for N = 50, 200 and 1000; only the initialisation compiles for
@@ -92,8 +93,8 @@ def monte_carlo(
       without `num_slots`, though not the same particles. `collect` receives the empty slots as
       well, with `occupied` false.
 
-    Raises `ValueError` for more devices than there are, fewer slots than particles, and `num_slots`
-    with the moves that need every slot, `PropagateIndependently` and `PropagateInClusters`.
+    Raises `ValueError` for fewer slots than particles, and for `num_slots` with the moves that need
+    every slot, `PropagateIndependently` and `PropagateInClusters`.
     """
     if num_slots is not None and num_slots < filter.num_particles:
         raise ValueError(f"num_slots: {num_slots} is not at least N, {filter.num_particles}")
@@ -106,7 +107,7 @@ def monte_carlo(
             starts = (keys, _start_each(keys, filter, series, int(num_slots)))
             filter = filter.replace(num_particles=int(num_slots))
         arguments = (filter, series, collect)
-        return over_devices(_run_each, _run_on_threads, starts, arguments, devices)
+        return over_devices(_run_each, _run_on_threads, starts, arguments, available_devices())
 
     return warn_of_start(sound(with_floats_traced(run, filter)), filter)
 

@@ -107,8 +107,7 @@ def run_study(
       settings, keys, data and versions are the same. The code of functions cannot be compared: use
       a new directory after you change it. False refuses a directory with cells.
     - `seeds_at_once`: how many seeds share one `vmap`; None is all. Set it if memory is short.
-    - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both. Several
-      processes must work on the same cell, and so run one cell at a time.
+    - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both.
     - `num_slots`: the length of the particle arrays, as for `monte_carlo`, in all cells with at
       most so many particles. A filter then compiles once for all these N. Use it for small filters,
       if the study spends more time on compiling than on running. A filter that fills every slot,
@@ -117,9 +116,8 @@ def run_study(
     Raises `ValueError` before anything runs: for an argument of another kind, for a `directory`
     with cells, and with `resume` for the directory of another study, naming the difference, and for
     truncated files in it. Delete such files, and only their cells run again. Raises `OSError` if a
-    cell cannot be written, for example on a full disk; finished cells remain. Several processes
-    share one directory, which the first one writes. Use it if a loop over `monte_carlo` would take
-    long.
+    cell cannot be written, for example on a full disk; finished cells remain. Use it if a loop over
+    `monte_carlo` would take long.
     """
     directory = Path(directory)
     cells, identity = _cells(study), _identity(study)
@@ -129,10 +127,8 @@ def run_study(
         )
     results = _read_cells(directory, identity)
     pending = [cell for cell in cells if cell.file not in results]
-    if results and jax.process_index() == 0:
+    if results:
         print(f"{directory}: {_summary(directory)} taken over, {len(pending)} to run")
-    if jax.process_count() > 1:
-        cells_at_once = 1
 
     def finish(cell: _Cell) -> None:
         try:
@@ -140,9 +136,8 @@ def run_study(
         except Exception as error:
             error.add_note(f"in the cell {cell.description}")
             raise
-        if jax.process_index() == 0:
-            described_by = {_STUDY: identity} | cell.description
-            write_described(directory / cell.file, measured, described_by)
+        described_by = {_STUDY: identity} | cell.description
+        write_described(directory / cell.file, measured, described_by)
         results[cell.file] = cell.description | measured
 
     bar = tqdm(total=len(cells), initial=len(results), unit="cell", disable=None)

@@ -1,8 +1,7 @@
-"""Many devices, processes and threads give the numbers of one; islands, and what they exchange."""
+"""Many devices and threads give the numbers of one; islands, and what they exchange."""
 
 import json
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -21,7 +20,7 @@ from mpfjax.operations import compiling
 from mpfjax.operations.compiling import cpu_options, in_little_memory
 from mpfjax.operations.islands import DEVICE_AXIS, ISLAND_AXIS
 from mpfjax.operations.segments import segment_sum
-from mpfjax.running.devices import choose_devices, over_threads
+from mpfjax.running.devices import over_threads
 from mpfjax.running.islands import IslandInteraction
 from tests import on_devices
 from tests.examples import make_mixture
@@ -39,47 +38,23 @@ def mean(mixture):
     return mixture.mean()
 
 
-# --- many devices and processes ------------------------------------------------------------------
-
-
-def start(*arguments, devices=1):
-    count = f"--xla_force_host_platform_device_count={devices}"
-    environment = os.environ | {
-        "PYTHONPATH": str(REPOSITORY),
-        "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {count}",
-    }
-    command = [sys.executable, "-m", "tests.on_devices", *map(str, arguments)]
-    options = {"cwd": REPOSITORY, "env": environment, "text": True}
-    return subprocess.Popen(command, stderr=subprocess.PIPE, **options)
-
-
 @pytest.fixture(scope="module")
-def started(tmp_path_factory):
-    """What eight devices in one process found, and two processes of one device."""
-    folder = tmp_path_factory.mktemp("devices")
-    with socket.socket() as server:
-        server.bind(("localhost", 0))
-        port = server.getsockname()[1]
-    files = {name: folder / f"{name}.npz" for name in ("eight", "first", "second")}
-    processes = [
-        start(files["eight"], devices=8),
-        start(files["first"], port, 0),
-        start(files["second"], port, 1),
-    ]
-    errors = [process.communicate(timeout=240)[1] for process in processes]
-    for process, error in zip(processes, errors, strict=True):
-        assert process.returncode == 0, error[-3000:]
-    found = {name: dict(np.load(file)) for name, file in files.items()}
-    return {name: (runs, json.loads(str(runs.pop("told")))) for name, runs in found.items()}
+def on_eight(tmp_path_factory):
+    """The runs of eight devices in a process of its own, and what its programs sent."""
+    file = tmp_path_factory.mktemp("devices") / "eight.npz"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
+    environment = {"PYTHONPATH": str(REPOSITORY), "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    command = [sys.executable, "-m", "tests.on_devices", str(file)]
+    subprocess.run(command, cwd=REPOSITORY, env=os.environ | environment, check=True, timeout=240)
+    runs = dict(np.load(file))
+    return runs, json.loads(str(runs.pop("sent")))
 
 
 @pytest.mark.weekly
 class TestManyDevices:
-    @pytest.mark.parametrize("which", ["eight", "first", "second"])
-    def test_give_the_numbers_of_one(self, started, which):
-        runs, told = started[which]
-        assert told["devices"] == (8 if which == "eight" else 2)
+    def test_give_the_numbers_of_one(self, on_eight):
+        runs, (num_devices, *_) = on_eight
+        assert num_devices == 8
         with float64(), jax.numpy_dtype_promotion("standard"):
             one = on_devices.leaves(
                 replicates=on_devices.replicates(), islands=on_devices.islands()
@@ -88,33 +63,13 @@ class TestManyDevices:
         for name, leaf in one.items():
             np.testing.assert_allclose(runs[name], leaf, rtol=1e-9, atol=1e-9)
 
-    @pytest.mark.parametrize("which", ["first", "second"])
-    def test_processes_must_pass_the_same_and_take_part(self, started, which):
-        told = started[which][1]
-        assert "keys, filter, observations: not the same in every process" in told["other keys"]
-        assert "leaves 1 of the processes without any" in told["left out"]
-
-    def test_islands_send_four_numbers_a_step_and_particles_where_they_exchange_them(self, started):
+    def test_islands_send_four_numbers_a_step_and_particles_where_they_exchange_them(
+        self, on_eight
+    ):
         """Of 256 particles in two components each: three parts of the mass, at once, and the mass,
         for whether an exchange is due; then a slot's state, weight, label and ancestor."""
-        found = sorted(tuple(each) for each in started["eight"][1]["collectives"])
-        gathered = [("all-gather", NUM_ISLANDS), ("all-gather", 3 * NUM_ISLANDS)]
-        assert found == [*gathered, *[("all-to-all", 256)] * 4]
-
-    def test_what_is_no_choice_of_devices_is_named(self, started):
-        told = started["eight"][1]
-        assert told["too many"] == "devices: 9 are not some of the 8 devices"
-        assert "are not some of the 8 devices" in told["twice"]
-        assert "cannot be split over 3 devices" in told["uneven"]
-        assert told["only device"]
-
-
-def test_the_devices_that_are_there_are_chosen_from():
-    with jax.default_device(jax.devices()[0]):
-        assert choose_devices(None) == jax.devices()[:1]
-    for devices in (0, 2, [], ["cpu"]):
-        with pytest.raises(ValueError, match="devices: "):
-            choose_devices(devices)
+        gathered = [["all-gather", NUM_ISLANDS], ["all-gather", 3 * NUM_ISLANDS]]
+        assert sorted(on_eight[1][1:]) == [*gathered, *[["all-to-all", 256]] * 4]
 
 
 # --- islands -------------------------------------------------------------------------------------

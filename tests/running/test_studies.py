@@ -14,7 +14,6 @@ import pytest
 
 import mpfjax
 from mpfjax import read_study, run_study
-from mpfjax.running import studies
 from tests.full_disk import no_room_beyond
 from tests.small_study import OBSERVATIONS, build, mean, measure, run_in_process, small_study
 from tests.user_models import TrickyQuadraticModel, nothing_traced
@@ -168,25 +167,6 @@ class TestBrokenOff:
             assert info.value.errno == errno.EFBIG
             assert contents(copy) == before
         np.testing.assert_equal(run_study(small_study(NUM_CELLS), copy, resume=True), alone[1])
-
-
-def test_of_several_processes_the_first_writes_and_all_have_the_results(
-    alone, tmp_path, monkeypatch
-):
-    """Each runs the cells one by one, in one order."""
-    monkeypatch.setattr(jax, "process_index", lambda: 1)
-    monkeypatch.setattr(studies.ThreadPoolExecutor, "map", None)
-
-    def in_one_process(*arguments, **options):
-        with monkeypatch.context() as patch:
-            patch.setattr(jax, "process_count", lambda: 1)
-            return mpfjax.monte_carlo(*arguments, **options)
-
-    monkeypatch.setattr(jax, "process_count", lambda: 2)
-    monkeypatch.setattr(studies, "monte_carlo", in_one_process)
-    results = run_study(small_study(NUM_CELLS), tmp_path, cells_at_once=2)
-    np.testing.assert_equal(results, alone[1])
-    assert not list(tmp_path.iterdir())
 
 
 class TestOtherFiles:
