@@ -35,9 +35,9 @@ from tqdm import tqdm
 
 import mpfjax
 from mpfjax import console
-from mpfjax.console import exit_status, write_json
-from mpfjax.files import write_whole
+from mpfjax.console import exit_status
 from mpfjax.running.results import format_table
+from mpfjax.running.storage import write_json, write_whole
 
 ROOT = Path(__file__).resolve().parents[1]
 Z_95 = 1.959963984540054

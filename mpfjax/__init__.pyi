@@ -81,13 +81,12 @@ from mpfjax.moves.regrouping.split import Split as Split
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample as AuxiliaryResample
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves.resampling.resample import Resample as Resample
+from mpfjax.operations.compiling import enable_compilation_cache as enable_compilation_cache
 from mpfjax.operations.random import normal as normal
 from mpfjax.report import StepInfo as StepInfo
 from mpfjax.running.islands import IslandInteraction as IslandInteraction
 from mpfjax.running.islands import run_islands as run_islands
-from mpfjax.running.late import Replay as Replay
 from mpfjax.running.long_runs import Checkpoint as Checkpoint
-from mpfjax.running.programs import enable_compilation_cache as enable_compilation_cache
 from mpfjax.running.results import ComponentTable as ComponentTable
 from mpfjax.running.results import FilterRun as FilterRun
 from mpfjax.running.results import component_table as component_table

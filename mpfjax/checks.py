@@ -14,10 +14,9 @@ own classes; `| None` adds None. Any other annotation is for readers alone.
 """
 
 import contextlib
-import difflib
 import functools
+import importlib
 import inspect
-import linecache
 import math
 import sys
 import traceback
@@ -26,7 +25,6 @@ import typing
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal, ParamSpec, TypeGuard, TypeVar
 
 import equinox as eqx
@@ -41,7 +39,6 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _INNER = ("mpfjax.", "equinox.", "jaxtyping.", "contextlib")  # modules that users need not see
-_JAX = ("jax", "jaxlib", "numpy")
 _LONGEST = 200
 _MOST = 2**31 - 1
 
@@ -154,8 +151,6 @@ class Rule:
 
     holds: Callable[[Any], Any]
     what: str
-    way_out: Callable[[Any], str] = lambda value: ""
-    """what to write instead of a value, if anything is to be said about it."""
 
     def __repr__(self) -> str:
         return self.what
@@ -163,10 +158,8 @@ class Rule:
     def check(self, value: Any, name: str) -> None:
         """Raise a `ValueError` for another value, by the argument's name."""
         if not self.holds(value):
-            way_out = f"write {value.__name__}(...)" if isinstance(value, type) else ""
-            way_out = way_out or self.way_out(value)
-            message = f"{name}: {shown(value)} is not {self.what}"
-            raise ValueError(f"{message}; {way_out}" if way_out else message)
+            hint = f"; write {value.__name__}(...)" if isinstance(value, type) else ""
+            raise ValueError(f"{name}: {shown(value)} is not {self.what}{hint}")
 
 
 def number(holds: Callable[[Any], Any], what: str) -> Rule:
@@ -243,12 +236,6 @@ def check(hint: Any, what: str = "", /, **arguments: Any) -> None:
 class Checked(eqx.Module):
     """A base of classes whose fields are checked by their annotations."""
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
-        """Raise a `TypeError` for arguments that its `__init__` does not take."""
-        if args or kwargs:  # copies and pickles are made of none, and filled afterwards
-            _bound(cls.__init__, (None, *args), kwargs)
-        return super().__new__(cls)
-
     def __check_init__(self) -> None:
         for name, rule in _rules(type(self)).items():
             rule.check(getattr(self, name), name)
@@ -259,31 +246,17 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> R:
+        kwargs = _with_new_names(function, kwargs)
         try:
-            kwargs = _with_new_names(function, kwargs)
-            values = _bound(function, args, kwargs)
-            for name, rule in _rules(function).items():
-                if name in values:
-                    rule.check(values[name], name)
-            return function(*args, **kwargs)
-        except Exception as error:
-            if line := _users_line(error):
-                _begin(error, *line)
-            error.__traceback__ = _outside(error.__traceback__)
-            raise
+            values = _signature(function).bind_partial(*args, **kwargs).arguments
+        except TypeError:
+            values = {}  # the call itself says which argument is none of its own
+        for name, rule in _rules(function).items():
+            if name in values:
+                rule.check(values[name], name)
+        return function(*args, **kwargs)
 
     return call
-
-
-def _bound(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
-    """The arguments of a call by name; a `TypeError` that says which of them are amiss."""
-    signature = _signature(function)
-    try:
-        return signature.bind(*args, **kwargs).arguments
-    except TypeError as error:
-        message = _misfit(signature, args, kwargs) or str(error)
-    who = function.__qualname__.rpartition("<locals>.")[2].removesuffix(".__init__")
-    raise TypeError(f"{who}: {message}")
 
 
 def _with_new_names(function: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -301,35 +274,6 @@ _FORMER_ARGUMENTS = {
     "sample_trajectories": {"model": "filter"},
 }
 _signature = functools.cache(inspect.signature)
-_OF_SERIES = {"inputs": "Series(y, inputs=u)", "missing": "Series.skipping(y)"}
-
-
-def _misfit(signature: inspect.Signature, args: tuple[Any, ...], kwargs: dict[str, Any]) -> str:
-    """What is amiss with the arguments of a call; nothing where it is something else."""
-    parameters = [each for name, each in signature.parameters.items() if name != "self"]
-    args = args["self" in signature.parameters :]
-    by_place = [each.name for each in parameters if each.kind is not each.KEYWORD_ONLY]
-    names, present = [each.name for each in parameters], {*by_place[: len(args)], *kwargs}
-    free = [name for name in names if name not in present]
-    for unknown in kwargs.keys() - names:
-        close = difflib.get_close_matches(unknown, free, 1)
-        hint = f"did you mean {close[0]}?" if close else f"it takes {', '.join(names)}"
-        if "observations" in names and unknown in _OF_SERIES:
-            hint = f"write observations={_OF_SERIES[unknown]}"
-        return f"{unknown} is none of its arguments; {hint}"
-    if len(args) > len(by_place):
-        by_name = ", ".join(names[len(by_place) :])
-        return f"{len(args)} arguments without a name; it takes {', '.join(by_place)}" + (
-            f", and by name {by_name}" if by_name else ""
-        )
-    missing = [each.name for each in parameters if each.name in free and each.default is each.empty]
-    # Without it, what follows has come in its place.
-    if missing and names[0] in ("key", "keys") and not (args and is_key(args[0])):
-        example = "split(jax.random.key(0), runs)" if names[0] == "keys" else "key(0)"
-        return f"{names[0]} is missing, the first argument, as jax.random.{example}"
-    is_or_are = "is" if len(missing) == 1 else "are"
-    return f"{', '.join(missing)} {is_or_are} missing" if missing else ""
-
 
 # By class: the rule for an argument of it, where it need not be an instance.
 RULES: dict[type, Rule] = {}
@@ -385,18 +329,9 @@ def _rule(hint: Any) -> Rule | None:
 
 def _keys(kind: Any) -> Rule:
     """The rule for one typed key, or for a row of them."""
-
-    def way_out(value: Any) -> str:
-        is_array = isinstance(value, jax.Array | np.ndarray)
-        if is_array and value.dtype == np.uint32 and value.shape[-1:] == (2,):
-            return "jax.random.key(0) makes typed keys, and jax.random.PRNGKey others"
-        if is_key(value) and not kind.dims:
-            return f"mpfjax.monte_carlo runs a filter for each of {value.size} keys"
-        return ""
-
     what = "a row of typed keys, as jax.random.split(jax.random.key(0), runs)"
     what = what if kind.dims else "one typed key, as jax.random.key(0)"
-    return Rule(lambda value: isinstance(value, kind) and value.size > 0, what, way_out)
+    return Rule(lambda value: isinstance(value, kind) and value.size > 0, what)
 
 
 def is_key(value: Any) -> bool:
@@ -411,76 +346,16 @@ def _instance(kind: type) -> Rule:
 
 @contextlib.contextmanager
 def saying(who: str, clause: str = "") -> Iterator[None]:
-    """Have an error of the user's own function begin with its name, what it is given, and the line.
-
-    Errors keep their type. `clause` is a clause, as "given a key".
-    """
+    """Add to an error of the user's own function a note with its name and what it is given."""
     try:
         yield
     except Exception as error:
-        _begin(error, who, *_users_line(error)[1:], clause)
+        error.add_note(f"{who}, {clause}" if clause else who)
         raise
-
-
-def _begin(error: Exception, *parts: str) -> None:
-    """Put what is known of where it comes from before the text of an error, the first time."""
-    if _BEGUN in vars(error):
-        return
-    setattr(error, _BEGUN, True)
-    prefix = ", ".join(filter(None, parts)) + ": "
-    if len(error.args) != 1 or not isinstance(error.args[0], str):
-        error.add_note(prefix)  # it makes its text of other things
-    elif isinstance(error, _OF_TRACERS):
-        first, *others = error.args[0].splitlines()
-        # Between them JAX prints what the number comes from, a page of its own operations.
-        link = [line for line in others if "https://" in line]
-        error.args = ("\n".join([prefix + _UNKNOWN_NUMBERS, first, *link]),)
-    else:
-        error.args = (prefix + error.args[0],)
-
-
-_BEGUN = "_says_where"
-_OF_TRACERS = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-)
-_UNKNOWN_NUMBERS = (
-    "Python or numpy asks here for numbers that JAX knows only as the program runs; write jnp.where"
-    " in place of `if`, and jax.numpy in place of numpy"
-)
-
-
-def _users_line(error: Exception) -> tuple[str, ...]:
-    """The user's own function in which it was raised, and the line; nothing where in none."""
-    frames = [at for at in traceback.walk_tb(error.__traceback__) if _root_of(at[0]) not in _JAX]
-    # What it calls may be of another library, but not of this one.
-    if not frames or _module_of(frames[-1][0]).startswith(_INNER):
-        return ()
-    users = [at for at in frames if not _module_of(at[0]).startswith(_INNER)]
-    function = users[0][0]
-    frame, line = [at for at in users if _root_of(at[0]) == _root_of(function)][-1]
-    path = frame.f_code.co_filename
-    text = linecache.getline(path, line).strip()
-    return function.f_code.co_qualname, f"line {line} of {Path(path).name}, `{text}`"
 
 
 def _module_of(frame: types.FrameType) -> str:
     return frame.f_globals.get("__name__", "")
-
-
-def _root_of(frame: types.FrameType) -> str:
-    return _module_of(frame).partition(".")[0]
-
-
-def _outside(traceback_: types.TracebackType | None) -> types.TracebackType | None:
-    """Its frames outside of the library, and the last one, unless JAX shows its own frames."""
-    result = None
-    for frame, line in reversed(list(traceback.walk_tb(traceback_))):
-        is_shown = result is None or getattr(jax.config, "jax_traceback_filtering", "") == "off"
-        if is_shown or not _module_of(frame).startswith(_INNER):
-            result = types.TracebackType(result, frame, frame.f_lasti, line)
-    return result
 
 
 def warn(message: str, category: type[Warning] = RuntimeWarning) -> None:
@@ -509,6 +384,14 @@ class Renamed:
         """The attribute of the new name."""
         warn(f"{owner.__name__}.{self.old} is now called {self.new}", DeprecationWarning)
         return getattr(owner if instance is None else instance, self.new)
+
+
+def optional(module: str, package: str) -> types.ModuleType:
+    """The module of an extra, or an `ImportError` that says how to install it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f"{module} is missing: pip install {package}") from error
 
 
 def shown(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Shared by all commands: reading numbers, writing whole files, one-line errors.
+"""Shared by all commands: reading numbers, clocks, one-line errors.
 
 A number out of range is an error of argparse, with exit status 2.
 """
@@ -7,7 +7,6 @@ import argparse
 import contextlib
 import gc
 import importlib
-import json
 import math
 import os
 import sys
@@ -18,8 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
-
-from mpfjax.files import write_whole
 
 
 def _read_by(
@@ -44,12 +41,6 @@ def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str], int]:
 seed = whole(0, 2**32 - 1)
 positive = _read_by(float, lambda number: 0 < number < math.inf, "a positive, finite number")
 finite = _read_by(float, math.isfinite, "a finite number")
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write `content` so that an interruption leaves the old file or the new one, never half."""
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    write_whole(path, lambda file: file.write(text.encode()))
 
 
 def check_outputs(folder: Path, outputs: Iterable[str], inputs: dict[str, Any]) -> None:
@@ -81,14 +72,14 @@ def exit_status(run: Callable[[], None], arguments: Sequence[str] | None = ()) -
     """
     with contextlib.suppress(OSError, RuntimeError):  # the latter where there is no home
         # Imported only now: reading the arguments does not wait for JAX.
-        importlib.import_module("mpfjax.running.programs").enable_compilation_cache()
+        importlib.import_module("mpfjax.operations.compiling").enable_compilation_cache()
     # Tracing leaves so many objects that Python's collector takes a third of the time before a
     # first result, by going through them again and again.
     gc.set_threshold(100_000, 20, 20)
     try:
         run()
     except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print("error:", "; ".join([str(error), *getattr(error, "__notes__", [])]), file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted; what was finished is written", file=sys.stderr)

@@ -69,20 +69,18 @@ def auxiliary_particle_filter(
     model: AbstractStateSpaceModel,
     num_particles: Count,
     lookahead: Lookahead,
-    *,
-    proposal: AbstractProposal | None = None,
 ) -> Filter:
     """The auxiliary particle filter: resample by w times a look-ahead to y_t, propagate.
 
     Pitt and Shephard (1999). `lookahead` is a function (y_t, states) -> log ν of each particle, or
-    a proposal with `log_normaliser`, which then also draws x_t unless another `proposal` is given.
-    Ẑ is unbiased for any look-ahead; see `AuxiliaryResample`. With `GaussNewtonProposal(1,
-    inflation=1.0)` for a `LinearGaussianModel` the filter is fully adapted: ν is p(y_t | x_{t-1}),
-    x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are equal. Use it if the likelihood is
-    narrow and y_t determines early which particles will survive. The filter is `with_lookahead`
-    applied to a `particle_filter`, and can be applied to any other filter in the same way.
+    a proposal with `log_normaliser`, which then also draws x_t. Ẑ is unbiased for any look-ahead;
+    see `AuxiliaryResample`. With `GaussNewtonProposal(1, inflation=1.0)` for a
+    `LinearGaussianModel` the filter is fully adapted: ν is p(y_t | x_{t-1}), x_t is drawn from
+    p(x_t | x_{t-1}, y_t), and all weights are equal. Use it if the likelihood is narrow and y_t
+    determines early which particles will survive. The filter is `with_lookahead` applied to a
+    `particle_filter`, and can be applied to any other filter in the same way.
     """
-    return with_lookahead(particle_filter(model, num_particles, proposal=proposal), lookahead)
+    return with_lookahead(particle_filter(model, num_particles), lookahead)
 
 
 @checked
@@ -261,12 +259,7 @@ def independent_particle_filters(model: MultiObjectModel, num_particles: Count) 
 
 
 @checked
-def clustered_particle_filter(
-    model: MultiObjectModel,
-    num_particles: Count,
-    *,
-    start: Literal["apart", "together"] = "apart",
-) -> Filter:
+def clustered_particle_filter(model: MultiObjectModel, num_particles: Count) -> Filter:
     """A joint filter for each cluster of objects; clusters merge when objects meet.
 
     Every object starts with a separate particle filter. Two objects meet if the interaction ψ
@@ -282,7 +275,7 @@ def clustered_particle_filter(
     distribution of a cluster may have several modes, such as two similar objects in either order.
     Their mean is then a position without an object: use the median.
     """
-    return Filter(model, [PropagateInClusters(start)], num_particles)
+    return Filter(model, [PropagateInClusters()], num_particles)
 
 
 @checked
@@ -291,7 +284,6 @@ def bernoulli_filter(
     num_particles: Count,
     max_targets: Count,
     *,
-    proposal: AbstractProposal | None = None,
     particles_per_birth: Count = 50,
     undetected_particles: Count = 400,
     resample: AbstractResampling | None = None,
@@ -318,7 +310,7 @@ def bernoulli_filter(
         undetected_particles=undetected_particles,
         resample=resample,
     )
-    return Filter(model, [Predict(proposal), associate], num_particles, max_targets + 1)
+    return Filter(model, [Predict(), associate], num_particles, max_targets + 1)
 
 
 def _grouping_options(

@@ -30,7 +30,6 @@ from mpfjax.operations.logarithms import (
     softmax,
 )
 from mpfjax.operations.prefix_sums import sum_before
-from mpfjax.operations.rows import along_rows, select_rows
 from mpfjax.operations.segments import (
     segment_any,
     segment_counts,
@@ -39,7 +38,7 @@ from mpfjax.operations.segments import (
     segment_sum,
     spread,
 )
-from mpfjax.operations.stored import take
+from mpfjax.operations.stored import along_rows, select_rows, take
 
 
 class MarginalisedState(NamedTuple):
@@ -219,11 +218,6 @@ class ParticleMixture(eqx.Module):
         squares = jnp.sum(values**2)
         return jnp.sum(values) ** 2 * (1 / jnp.where(squares > 0, squares, jnp.inf))
 
-    def component_sums(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, "m *rest"]:
-        """Σ_{c_i = m} v_i over each component's slots, in floating point."""
-        self._require_one()
-        return segment_sum(_numbers(values), self.component_indicators, self.num_components)
-
     def component_expectations(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, "m *rest"]:
         """Σ_{c_i = m} w_i v_i, the weighted mean of `values` in each component, zero if empty.
 
@@ -232,7 +226,8 @@ class ParticleMixture(eqx.Module):
         values = _numbers(values)
         weights = self.component_weights.astype(values.dtype)
         filled = jnp.where(along_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
-        return self.component_sums(along_rows(weights, values) * filled)
+        products = along_rows(weights, values) * filled
+        return segment_sum(products, self.component_indicators, self.num_components)
 
     def component_groups(self, groups: Int[Array, " n"]) -> Int[Array, " m"]:
         """The group of each component, where the particles of each are of one."""
@@ -481,27 +476,15 @@ def no_ancestors(mixture: ParticleMixture) -> Int[Array, " n"]:
     return jnp.full_like(mixture.ancestor_indices, NO_ANCESTOR)
 
 
-def single_component(
-    particles: PyTree, num_components: int = 1, usable_slots: Int[Array, ""] | None = None
-) -> ParticleMixture:
-    """Equally weighted particles, all in component 0, each its own ancestor.
-
-    With `usable_slots` only the first `usable_slots` are particles; the other slots stay empty.
-    """
+def single_component(particles: PyTree, num_components: int = 1) -> ParticleMixture:
+    """Equally weighted particles, all in component 0, each its own ancestor."""
     num_slots = jax.tree.leaves(particles)[0].shape[0]
-    slot = jnp.arange(num_slots, dtype=jnp.int32)
-    if usable_slots is None:
-        log_weights = jnp.full(num_slots, -jnp.log(num_slots), default_float())
-    else:
-        log_share = -jnp.log(usable_slots.astype(default_float()))
-        log_weights = jnp.where(slot < usable_slots, log_share, -jnp.inf)
     return ParticleMixture(
         particles=particles,
-        log_weights=log_weights,
+        log_weights=jnp.full(num_slots, -jnp.log(num_slots), default_float()),
         component_indicators=jnp.zeros(num_slots, jnp.int32),
-        ancestor_indices=slot,
+        ancestor_indices=jnp.arange(num_slots, dtype=jnp.int32),
         num_components=num_components,
-        usable_slots=usable_slots,
     )
 
 

@@ -15,6 +15,11 @@ BROKEN_DENSITY = (
     " [0, M)"
 )
 
+# Fields that are None unless a memory fills them.
+_BY_MEMORIES = (
+    "log_marginal_likelihood_error", "mixture_weight_errors", "log_evidence_against_start", "alarm",
+)  # fmt: skip
+
 
 class StepInfo(eqx.Module):
     """The report of a step, which is returned with its mixture.
@@ -46,10 +51,10 @@ class StepInfo(eqx.Module):
     resampled: Bool[Array, " m"]
     degenerate: Bool[Array, ""]
     labels_ran_out: Bool[Array, ""]
-    log_marginal_likelihood_error: Float[Array, ""] | None = None
-    mixture_weight_errors: Float[Array, " m"] | None = None
-    log_evidence_against_start: Float[Array, ""] | None = None
-    alarm: Bool[Array, ""] | None = None
+    log_marginal_likelihood_error: Float[Array, ""] | None
+    mixture_weight_errors: Float[Array, " m"] | None
+    log_evidence_against_start: Float[Array, ""] | None
+    alarm: Bool[Array, ""] | None
     surprised = Renamed("surprised", "alarm")
 
     @property
@@ -74,7 +79,7 @@ def report_of(mixture: ParticleMixture, **additions: Array) -> StepInfo:
         "degenerate": increment == -jnp.inf,
         "labels_ran_out": jnp.all(sizes > 0) & (mixture.num_components > 1),
     }
-    return StepInfo(**fields | additions)
+    return StepInfo(**fields | dict.fromkeys(_BY_MEMORIES) | additions)
 
 
 def with_densities(value: PyTree, increments: Float[Array, "*runs_and_t"]) -> PyTree:

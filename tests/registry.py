@@ -32,6 +32,7 @@ from mpfjax import (
     Split,
 )
 from mpfjax.lookahead.pilot import AbstractLookahead
+from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.moves.resampling.gaussian import RegenerateObjects
@@ -241,6 +242,6 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     ),
     "clusters": _joint(lambda joint: mpfjax.clustered_particle_filter(joint, NUM_PARTICLES)),
     "objects that cross in one cluster": _joint(
-        lambda joint: mpfjax.clustered_particle_filter(joint, NUM_PARTICLES, start="together")
+        lambda joint: mpfjax.Filter(joint, [PropagateInClusters("together")], NUM_PARTICLES)
     ),
 }

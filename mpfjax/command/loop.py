@@ -22,8 +22,9 @@ from mpfjax.command.source import (
     read_boxes,
 )
 from mpfjax.command.source import check_options as check_options
-from mpfjax.console import Clock, peak_memory, write_json
+from mpfjax.console import Clock, peak_memory
 from mpfjax.metrics import multi_object_scores
+from mpfjax.running.storage import write_json
 from mpfjax.vision.boxes.following import follow_boxes
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames

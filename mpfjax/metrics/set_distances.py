@@ -18,9 +18,6 @@ from mpfjax.checks import Positive, checked, number
 
 Exponent = Annotated[float, number(lambda p: 1 <= p < np.inf, "a finite number of at least 1")]
 
-# Costs below this share of the largest are lost in the sums of the search.
-_FINE = 1e-8
-
 
 class OSPA(NamedTuple):
     """The result of `ospa`: distance^exponent = localisation + cardinality, a mean per object.
@@ -71,13 +68,11 @@ def ospa(
     an exponent below 1 or infinite. Use it for an error per object; `gospa` reports how many
     objects were missed.
     """
-    shares, num_estimates, num_truths = _pair(estimates, truths, cutoff, exponent)
+    costs, num_estimates, num_truths = _pair(estimates, truths, cutoff, exponent)
     size, num_alone = max(num_estimates, num_truths, 1), abs(num_estimates - num_truths)
-    return OSPA(
-        distance=cutoff * _norm(shares, num_alone, exponent) / size ** (1 / exponent),
-        localisation=float(np.sum((cutoff * shares) ** exponent)) / size,
-        cardinality=_times(num_alone / size, cutoff, exponent),
-    )
+    localised, alone, unit = np.sum(costs) / size, num_alone / size, cutoff**exponent
+    distance = cutoff * (localised + alone) ** (1 / exponent)
+    return OSPA(float(distance), float(unit * localised), unit * alone)
 
 
 @checked
@@ -100,54 +95,24 @@ def gospa(
     Raises `ValueError` as `ospa` does. Use it to score trackers that may lose objects or report
     false ones.
     """
-    shares, num_estimates, num_truths = _pair(estimates, truths, cutoff, exponent)
-    near, num_far = shares[~(shares >= 1)], np.sum(shares >= 1)
-    missed, false = (
-        _times(num_far / 2 + max(number - len(shares), 0) / 2, cutoff, exponent)
-        for number in (num_truths, num_estimates)
-    )
-    return GOSPA(
-        distance=cutoff * _norm(shares, abs(num_estimates - num_truths) / 2, exponent),
-        localisation=float(np.sum((cutoff * near) ** exponent)),
-        missed=missed,
-        false=false,
-    )
-
-
-def _norm(shares: Float[np.ndarray, " s"], cost_alone: float, exponent: float) -> float:
-    """(Σ share^exponent + cost_alone)^(1 / exponent), also where powers of shares underflow."""
-    unit = 1.0 if cost_alone > 0 else float(np.max(shares, initial=0.0))
-    total = np.sum((shares / (unit or 1.0)) ** exponent) + cost_alone
-    return unit * float(total) ** (1 / exponent)
-
-
-def _times(share: float, cutoff: float, exponent: float) -> float:
-    """share cutoff^exponent, 0 of nothing."""
-    return float(share * np.float64(cutoff) ** exponent) if share > 0 else 0.0
+    costs, num_estimates, num_truths = _pair(estimates, truths, cutoff, exponent)
+    near, unit = costs[~(costs >= 1)], cutoff**exponent
+    missed, false = ((number - len(near)) / 2 for number in (num_truths, num_estimates))
+    localised = np.sum(near)
+    distance = cutoff * (localised + missed + false) ** (1 / exponent)
+    return GOSPA(float(distance), float(unit * localised), unit * missed, unit * false)
 
 
 def _pair(
     estimates: Any, truths: Any, cutoff: float, exponent: float
 ) -> tuple[Float[np.ndarray, " s"], int, int]:
-    """The distances of the cheapest pairing, in units of the cutoff, at most one; both numbers.
-
-    The search is repeated with the largest distance that it found below the cutoff as the unit, in
-    which the powers of those that compete are numbers that it can add. A distance of the cutoff, or
-    one of more than all of these together, costs `most`: how much more makes no difference.
-    """
+    """(d / cutoff)^exponent of the cheapest pairing, each at most one; both numbers."""
     estimates = to_rows(None, "estimates", estimates)
     truths = to_rows(estimates.shape[1], "truths", truths)
-    distances = np.minimum(cdist(estimates, truths) / cutoff, 1.0)
-    if np.isnan(distances).any():
-        return np.full(min(distances.shape), np.nan), *distances.shape
-    unit, most = 1.0, min(distances.shape) + 1.0
-    while True:
-        with np.errstate(over="ignore"):
-            pairs = linear_sum_assignment(np.minimum((distances / unit) ** exponent, most))
-        largest = np.max(distances[pairs], where=distances[pairs] < 1, initial=0.0)
-        if largest == 0 or (largest / unit) ** exponent >= _FINE:
-            return distances[pairs], *distances.shape
-        unit = largest
+    costs = np.minimum(cdist(estimates, truths) / cutoff, 1.0) ** exponent
+    if np.isnan(costs).any():
+        return np.full(min(costs.shape), np.nan), *costs.shape
+    return costs[linear_sum_assignment(costs)], *costs.shape
 
 
 @checked

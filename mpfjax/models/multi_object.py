@@ -24,7 +24,7 @@ from mpfjax.models.base import (
 from mpfjax.models.law import refuse_marginalised
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.random import split
-from mpfjax.operations.rows import select_rows
+from mpfjax.operations.stored import select_rows
 
 # A number of particles that is hardly ever the length of a parameter's axis.
 _TRIAL = 1_000_003

@@ -18,8 +18,7 @@ from mpfjax.memory import Memory, Offspring
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractPropagation, Step, is_missing
-from mpfjax.operations.rows import select_rows
-from mpfjax.operations.stored import take
+from mpfjax.operations.stored import select_rows, take
 
 REFERENCE = "reference"  # the name of its slot in a mixture's memory
 

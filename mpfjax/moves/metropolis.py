@@ -17,7 +17,7 @@ from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.moves.base import AbstractMarkovMove, Gradient, Step, is_missing
 from mpfjax.operations.logarithms import add_gradient, without_gradient
 from mpfjax.operations.random import split, uniform
-from mpfjax.operations.rows import select_rows
+from mpfjax.operations.stored import select_rows
 
 # A step of 2% to 100% of the dynamics' standard deviation suits likelihoods from narrow to broad.
 _LEAST_STEP = 0.02

@@ -1,4 +1,4 @@
-"""Compilation: on wide vectors, once for all values of a model's floats."""
+"""Compilation: on wide vectors, once for all values of a model's floats, and kept on disk."""
 
 import contextlib
 import functools
@@ -9,6 +9,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, cast
 
 import equinox as eqx
@@ -16,11 +17,13 @@ import jax
 import jax.extend.core
 import jax.numpy as jnp
 from jax.core import Tracer
+from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import PyTree
 
 # Since this version XLA sums on vectors, and long rows by a library, in any order.
 _SUMS_ON_VECTORS = (0, 10)
 _FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
+_CACHE_FOLDER = "jax_compilation_cache_dir"
 
 
 def cpu_options(
@@ -115,6 +118,32 @@ def _older_emitters() -> dict[str, int | str]:
     except jax.errors.JaxRuntimeError:
         return {}
     return options
+
+
+def enable_compilation_cache() -> Path:
+    """Keep compiled programs in a folder: a later process that needs the same ones starts sooner.
+
+    This switches on JAX's persistent compilation cache, for every program of the process, whatever
+    its size and its time to compile. A program is traced and then found by its operations, its
+    options, JAX and the processor; numbers in a model may differ. Nothing is ever deleted, but you
+    may delete the folder at any time. Its content is executed: do not let others write to it.
+
+    Returns the folder: `jax_compilation_cache_dir` if that is set, and otherwise `mpfjax` in the
+    user's folder of caches ($XDG_CACHE_HOME, or ~/.cache). Raises `OSError` where it cannot be
+    made. Use it once, at the beginning of a script or notebook; the commands of mpfjax and its
+    benchmarks do.
+    """
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    setting: str | None = getattr(jax.config, _CACHE_FOLDER)
+    path = Path(setting or caches / "mpfjax")
+    path.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if str(path) != setting:
+        jax.config.update(_CACHE_FOLDER, str(path))
+        # An earlier compilation may have decided that there is no cache.
+        compilation_cache.reset_cache()
+    return path
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """What XLA computes once and keeps, branches that runs take together, gathers and scatters.
 
-In numpy: `values.copy()`, `values.astype(int)`, `values[indices]` and `np.bincount(places)`. XLA
+In numpy: `values.copy()`, `values.astype(int)`, `values[indices]`, `np.bincount(places)` and
+`np.where(chosen[:, None], new, old)`, with as many `None` as the arrays need. XLA
 fuses a computation into everything that uses its result, and then repeats it for every use. It does
 not fuse across the call of a function that it must not inline, and a call that does nothing takes
 no time. Nor does it fuse across a condition. Under `vmap`, `jax.lax.cond` becomes a `where` as soon
@@ -103,6 +104,20 @@ def count_places(
     """How many of the entries name each place, all of which must be in [0, num_places)."""
     counts = jnp.zeros(num_places, dtype).at[places.astype(jnp.uint32)]
     return counts.add(1, mode="promise_in_bounds")
+
+
+def along_rows(values: Shaped[Array, "*n"], rows: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
+    """The values of each row with further axes of length one, as many as the rows have."""
+    return jnp.expand_dims(values, tuple(range(values.ndim, rows.ndim)))
+
+
+def select_rows(is_new: Bool[Array, "*n"], new: PyTree, old: PyTree) -> PyTree:
+    """The `new` rows of every leaf where they are chosen, and the `old` ones elsewhere."""
+
+    def select(new: Array, old: Array) -> Array:
+        return jnp.where(along_rows(is_new, new), new, old)
+
+    return jax.tree.map(select, new, old)
 
 
 def cond_if_any(

@@ -14,7 +14,7 @@ from mpfjax.checks import NotNegative, Rule, check, warn
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.gaussians import log_normal
 from mpfjax.operations.random import normal, split, uniform
-from mpfjax.operations.rows import select_rows
+from mpfjax.operations.stored import select_rows
 from mpfjax.robots.maps import OccupancyGrid, Poses
 from mpfjax.robots.motion import wrap
 from mpfjax.robots.sensors import POSE

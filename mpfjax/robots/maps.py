@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool, Float, Shaped
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from mpfjax.arrays import FINITE, Fitting, check_spacing, to_numbers
-from mpfjax.checks import Positive, checked, warn
-from mpfjax.extras import optional
+from mpfjax.checks import Positive, checked, optional, warn
 from mpfjax.models.base import replace_fields
 from mpfjax.operations.stored import stored
 

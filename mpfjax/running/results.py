@@ -50,8 +50,8 @@ class FilterRun(eqx.Module):
     resampled: Bool[Array, "t m"]
     degenerate: Bool[Array, " t"]
     effective_sample_size: Float[Array, " t"]
-    log_evidence_against_start: Float[Array, " t"] | None = None
-    alarm: Bool[Array, " t"] | None = None
+    log_evidence_against_start: Float[Array, " t"] | None
+    alarm: Bool[Array, " t"] | None
     surprised = Renamed("surprised", "alarm")
 
     @property

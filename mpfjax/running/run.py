@@ -44,10 +44,10 @@ def run_filter(
 
     - `observations`: a pytree whose leaves have a leading axis t; or a `Series`, for which `inputs`
       and `missing` are short.
-    - `collect`: a function of the mixture after each step, or of (mixture, t, u_t) with t from 1
-      on; its results are stacked over t. None stores the whole mixture. The same function object
-      compiles once; a new lambda in every call compiles again. Methods of a mixture are for a
-      single mixture: `jax.vmap(lambda m: m.mean())` maps them over a collected stack.
+    - `collect`: a function of the mixture after each step, whose `t` is the step; its results are
+      stacked over t. None stores the whole mixture. The same function object compiles once; a new
+      lambda in every call compiles again. Methods of a mixture are for a single mixture:
+      `jax.vmap(lambda m: m.mean())` maps them over a collected stack.
     - `inputs`: u_1, ..., u_t, known data besides the observations: a pytree of finite numbers whose
       leaves have a leading axis t. At each step the model finds u_t in its field `inputs`; see
       `AbstractStateSpaceModel`. A step without an observation has an input nevertheless.

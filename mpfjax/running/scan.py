@@ -1,10 +1,8 @@
 """One run of a filter as one scan."""
 
-import inspect
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,32 +31,19 @@ def scan(
     keys_initial, keys = split_for_run(key, num_initial, series.length, num_moves)
 
     def advance(
-        mixture: ParticleMixture, step: tuple[Array, Series, Array | None]
+        mixture: ParticleMixture, step: tuple[Array, Series]
     ) -> tuple[ParticleMixture, PyTree]:
-        step_keys, now, t = step
+        step_keys, now = step
         mixture, info = step_or_predict(filter, step_keys, mixture, now)
         with saying("collect", "called with the mixture after each step"):
-            arguments: tuple[Any, ...] = (mixture,) if t is None else (mixture, t, now.inputs)
-            values = mixture if collect is None else collect(*arguments)
+            values = mixture if collect is None else collect(mixture)
         return mixture, (values, report_of(info))
 
     if initial is None:
         initial = first_mixture(keys_initial, filter, series)
     check_run(initial.memory, series.length)
-    times = jnp.arange(1, series.length + 1) if takes_time(collect) else None
-    final, outputs = jax.lax.scan(advance, initial, (keys, series, times))
+    final, outputs = jax.lax.scan(advance, initial, (keys, series))
     return run_of(initial, final, *outputs)
-
-
-def takes_time(collect: Any) -> bool:
-    """Whether `collect` takes (mixture, t, u_t), and not the mixture alone."""
-    try:
-        inspect.signature(collect).bind(None)
-    except TypeError:
-        return collect is not None
-    except ValueError:  # functions not written in Python cannot be inspected
-        pass
-    return False
 
 
 def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> ParticleMixture:

@@ -8,16 +8,16 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping
-from typing import Any
+import secrets
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
-
-from mpfjax.files import write_whole
 
 _MOST_SHOWN = 4
 _DESCRIPTION = "description"
@@ -205,6 +205,38 @@ def _static_fields(tree: PyTree, place: tuple[Any, ...]) -> dict[str, str]:
         if is_inner(node):
             texts |= _static_fields(node, place + inner)
     return texts
+
+
+def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
+    """Write a file so that an interruption or an error leaves the old one or the new one.
+
+    Several threads and processes may write one path. The file is that of the last one to end, and
+    it is whole whenever it is read. Raises `OSError` that names the file where there is no room for
+    it, or no permission.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Writers that shared a name would write into each other's file, and take it from each other.
+    partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
+    try:
+        with open(partial, "xb") as file:
+            write(file)
+            file.flush()
+            # Without it, the file could be empty under its new name after a power cut.
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except BaseException as error:
+        partial.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            fault = f"{error.strerror or error}; nothing that was written before is lost"
+            raise OSError(error.errno, fault, str(path)) from error
+        raise
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write `content` so that an interruption leaves the old file or the new one, never half."""
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    write_whole(path, lambda file: file.write(text.encode()))
 
 
 def write_described(

@@ -1,6 +1,5 @@
 """Monte Carlo studies over filters, numbers of particles and settings, which can be interrupted."""
 
-import datetime
 import importlib
 import itertools
 import os
@@ -33,7 +32,7 @@ from mpfjax.running.storage import (
 
 Values = Sequence[Any] | np.ndarray | Array
 
-_STUDY, _MOST_FAULTS = "study", 4
+_STUDY = "study"
 _TAKEN = {"filter", "num_particles", "file", "description", _STUDY}
 _CELL_FILE = re.compile(r"(\d+)-[\w.+-]*\.npz")  # as `_cells` names them
 
@@ -102,10 +101,10 @@ def run_study(
                              observations, settings={"noise": [0.1, 0.3]})
         results = mpfjax.run_study(study, "results/circle")
 
-    - `resume`: reuse the finished cells in `directory`, and print how many these are and from which
-      day. They belong to this study if names (of filters, `measure` and `collect`), sizes,
-      settings, keys, data and versions are the same. The code of functions cannot be compared: use
-      a new directory after you change it. False refuses a directory with cells.
+    - `resume`: reuse the finished cells in `directory`, and print how many these are. They belong
+      to this study if names (of filters, `measure` and `collect`), sizes, settings, keys, data and
+      versions are the same. The code of functions cannot be compared: use a new directory after you
+      change it. False refuses a directory with cells.
     - `seeds_at_once`: how many seeds share one `vmap`; None is all. Set it if memory is short.
     - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both.
     - `num_slots`: the length of the particle arrays, as for `monte_carlo`, in all cells with at
@@ -121,14 +120,12 @@ def run_study(
     """
     directory = Path(directory)
     cells, identity = _cells(study), _identity(study)
-    if _cell_files(directory) and not resume:
-        raise ValueError(
-            f"directory: {directory} holds {_summary(directory)}; resume=True continues"
-        )
+    if (files := _cell_files(directory)) and not resume:
+        raise ValueError(f"directory: {directory} holds {len(files)} cells; resume=True continues")
     results = _read_cells(directory, identity)
     pending = [cell for cell in cells if cell.file not in results]
     if results:
-        print(f"{directory}: {_summary(directory)} taken over, {len(pending)} to run")
+        print(f"{directory}: {len(results)} cells taken over, {len(pending)} to run")
 
     def finish(cell: _Cell) -> None:
         try:
@@ -223,13 +220,6 @@ def _cell_files(directory: Path) -> list[Path]:
     return [path for _, path in sorted((int(name[1]), path) for name, path in matches if name)]
 
 
-def _summary(directory: Path) -> str:
-    """How many cells the directory holds, and of which day."""
-    times = [path.stat().st_mtime for path in _cell_files(directory)]
-    days = sorted({str(datetime.date.fromtimestamp(time)) for time in (min(times), max(times))})
-    return f"{len(times)} finished cells of {' to '.join(days)}"
-
-
 def _read_cells(
     directory: Path, identity: dict[str, str] | None = None
 ) -> dict[str, dict[str, Any]]:
@@ -238,20 +228,15 @@ def _read_cells(
     They are all of one study, that of the first where none is given.
     """
     # An error, not a warning and a second run: if one file is damaged, others may be as well.
-    results, faults = {}, []
+    results = {}
     for path in _cell_files(directory):
-        try:
-            arrays, description = read_described(path)
-            other = dict(description.pop(_STUDY, {}))
-            identity = identity or other
-            if other != identity:
-                raise ValueError(f"{path}: of another study ({differences(other, identity)})")
-            results[path.name] = description | arrays
-        except ValueError as error:
-            faults.append(str(error))
-    if faults:
-        reasons = "; ".join(faults[:_MOST_FAULTS])
-        raise ValueError(f"directory: {reasons}; delete such files, and only their cells run again")
+        arrays, description = read_described(path)
+        other = dict(description.pop(_STUDY, {}))
+        identity = identity or other
+        if other != identity:
+            what = f"of another study ({differences(other, identity)})"
+            raise ValueError(f"directory: {path}: {what}; delete it, and only its cell runs again")
+        results[path.name] = description | arrays
     return results
 
 

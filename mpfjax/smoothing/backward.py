@@ -20,8 +20,7 @@ from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.prefix_sums import needs_units, sum_before, to_units, unit_bits
 from mpfjax.operations.random import below, split, uniform
-from mpfjax.operations.rows import along_rows
-from mpfjax.operations.stored import take
+from mpfjax.operations.stored import along_rows, take
 
 # How many densities are held at once: rows of states are taken together up to this.
 MOST_DENSITIES = 2**22

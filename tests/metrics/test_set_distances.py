@@ -100,10 +100,9 @@ def test_empty_sets():
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize(("order", "cutoff"), [(30.0, 200.0), (30.0, 20.0), (2.0, 5000.0)])
-def test_distances_far_below_the_cutoff_pair_as_well(order, cutoff):
-    """Their powers are no numbers in float32, or lost beside that of the cutoff; in float64."""
-    rng, pairs = np.random.default_rng(0), []
+def test_distances_far_below_the_cutoff_pair_as_well():
+    """Beside the power of the cutoff theirs would be lost in float32."""
+    rng, pairs, cutoff, order = np.random.default_rng(0), [], 5000.0, 2.0
     for num_far in (0, 0, 1, 1, 2):
         truths = rng.uniform(0.0, 3.0, (4, 2))
         estimates = truths[rng.permutation(4)] + rng.normal(0.0, 0.7, (4, 2))

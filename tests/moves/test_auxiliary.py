@@ -66,7 +66,9 @@ def test_what_is_expected_stays_the_same_in_every_component():
     def sums(mixture):
         scaled = mixture.weights * jnp.exp(mixture.log_scale)
         values = jnp.stack([jnp.ones(30), mixture.particles, mixture.particles**2], axis=1)
-        return mixture.component_sums(scaled[:, None] * values)
+        return segment_sum(
+            scaled[:, None] * values, mixture.component_indicators, mixture.num_components
+        )
 
     now = mpfjax.Step(SQUARE, jnp.float32(1.5))
     one = jax.jit(jax.vmap(lambda key: sums(move(key, MIXTURE, now))))

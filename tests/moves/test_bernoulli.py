@@ -275,11 +275,10 @@ def test_objects_not_detected_yet_are_those_of_gaussian_sums(proposal):
     number, rate, survival = 2.0, 0.5, 0.95
     first, second = np.array([-2.5, 2.0]), 2.2
     old, new, undetected, log_evidence = gaussian_sums(number, rate, survival, first, [second])
-    filter = mpfjax.bernoulli_filter(
-        model(rate, survival_probability=survival, initial_number=number), 3000, 6,
-        particles_per_birth=500, undetected_particles=1000, resample=mpfjax.Resample(),
-        proposal=proposal,
-    )  # fmt: skip
+    options = {"particles_per_birth": 500, "undetected_particles": 1000}
+    move = Associate(resample=mpfjax.Resample(), **options)
+    targets = model(rate, survival_probability=survival, initial_number=number)
+    filter = Filter(targets, [Predict(proposal), move], 3000, 7)
     scans = jnp.asarray([[[-2.5], [2.0]], [[second], [NAN]]], jnp.float32)
     runs = mpfjax.monte_carlo(
         jax.random.split(KEY, 20), filter, scans, collect=mpfjax.estimate_targets

@@ -8,6 +8,7 @@ import pytest
 
 import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion
+from mpfjax.moves.objects.clusters import PropagateInClusters
 from tests.examples import stack, walker
 from tests.moves.test_partitioned import NOISES, assert_both_unbiased, pair_on_a_grid
 
@@ -88,7 +89,7 @@ class Momentum(mpfjax.AbstractStateSpaceModel):
 @pytest.mark.exactness
 def test_crossing_keeps_a_state_that_holds_the_past():
     """Of two AR2 objects in one cluster, whose evidence is that of `test_chains.py`."""
-    filter = mpfjax.clustered_particle_filter(MultiObjectModel(Momentum(), 2), 45, start="together")
+    filter = mpfjax.Filter(MultiObjectModel(Momentum(), 2), [PropagateInClusters("together")], 45)
     before = filter.init(KEY)
     after, _ = filter.step(KEY, before, OBSERVATIONS[0, :2])
     pasts, parents = np.asarray(after.particles[:, :, 1]), np.asarray(before.particles[:, :, 0])

@@ -37,7 +37,8 @@ def test_a_program_is_found_again_after_all_are_forgotten(settings, tmp_path):
     jax.monitoring.register_event_listener(
         lambda event, **_: hits.append(event) if event.endswith("cache_hits") else None
     )
-    assert enable_compilation_cache(tmp_path / "kept" / "here") == tmp_path / "kept" / "here"
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert enable_compilation_cache() == tmp_path / "caches" / "mpfjax"
     for is_kept in (False, True):
         jax.clear_caches()
         hits.clear()
@@ -45,17 +46,11 @@ def test_a_program_is_found_again_after_all_are_forgotten(settings, tmp_path):
         assert bool(hits) == is_kept
 
 
-def test_the_folder_is_the_users_own_unless_jax_has_one(settings, tmp_path):
+def test_the_folder_of_jax_is_used_if_it_has_one(settings, tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path / "of jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 7.0)
     assert enable_compilation_cache() == tmp_path / "of jax"
     assert getattr(jax.config, SETTINGS[1]) == 0.0  # every program is kept
-    jax.config.update("jax_compilation_cache_dir", None)
-    assert enable_compilation_cache() == tmp_path / "caches" / "mpfjax"
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match="file"):
-        enable_compilation_cache(tmp_path / "file" / "folder")
-    assert getattr(jax.config, SETTINGS[0]) == str(tmp_path / "caches" / "mpfjax")
 
 
 @pytest.mark.exactness

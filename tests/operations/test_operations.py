@@ -26,7 +26,6 @@ from mpfjax.operations.prefix_sums import (
     to_units,
     unit_bits,
 )
-from mpfjax.operations.rows import select_rows
 from mpfjax.operations.segments import (
     segment_any,
     segment_argmax,
@@ -42,6 +41,7 @@ from mpfjax.operations.stored import (
     cond_if_any,
     count_places,
     drawn_once,
+    select_rows,
     take,
     whole_blocks,
 )

@@ -8,14 +8,14 @@ from tests.bugs import BUGS
 PACKAGE = Path(__file__).resolve().parents[2] / "mpfjax"
 # From the ground up: each part may import from those above it here, and from itself.
 ORDER = """
-    files extras checks arrays operations memory mixture models moves report filter running
+    checks arrays operations memory mixture models moves report filter running
     lookahead transforms filters trial smoothing console exact metrics vision robots tuning
     plotting command __main__
 """
 # Inside the folders that hold several floors: files, and folders.
 FLOORS = {
     "operations": """
-        logarithms islands rows stored matrices compiling random prefix_sums segments
+        logarithms islands stored matrices compiling random prefix_sums segments
     """,
     "moves": """
         base eve_indices conditional every regrouping resampling propagation metropolis
@@ -25,7 +25,7 @@ FLOORS = {
     "lookahead": "quadratics pilot twisted regression learned",
     "robots": "maps motion sensors localisation pose",
     "running": """
-        storage programs long_runs devices results keys scan diagnosis run late islands studies
+        storage long_runs devices results keys scan diagnosis run islands studies
     """,
 }
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
@@ -78,7 +78,7 @@ CORE = """
     moves/resampling/allocation moves/resampling/ancestors moves/resampling/line
     moves/resampling/resample moves/resampling/sorting
     operations/compiling operations/islands operations/logarithms operations/prefix_sums
-    operations/random operations/rows operations/segments operations/stored
+    operations/random operations/segments operations/stored
 """
 
 

@@ -1,9 +1,7 @@
 """A study that is broken off, however it is, ends as one that was left alone."""
 
-import datetime
 import errno
 import multiprocessing
-import os
 import shutil
 import signal
 import time
@@ -188,15 +186,12 @@ class TestOtherFiles:
         assert contents(alone[0]) == before
 
     def test_a_folder_that_holds_cells_is_refused_unless_it_is_said(self, alone, copy, capsys):
-        """Then it tells how many cells it takes over, and of which days."""
-        with pytest.raises(ValueError, match=r"directory: .*holds 5 finished cells of .*resume"):
+        """Then it tells how many cells it takes over."""
+        with pytest.raises(ValueError, match=r"directory: .*holds 5 cells; resume"):
             run_study(small_study(NUM_CELLS), copy)
-        noon = datetime.datetime(2020, 2, 29, 12).timestamp()
         files_of(copy)[-1].unlink()
-        for path in files_of(copy):
-            os.utime(path, (noon, noon))
         results = run_study(small_study(NUM_CELLS), copy, resume=True)
-        said = f"{copy}: 4 finished cells of 2020-02-29 taken over, 1 to run\n"
+        said = f"{copy}: 4 cells taken over, 1 to run\n"
         assert capsys.readouterr().out == said
         np.testing.assert_equal(results, alone[1])
 
@@ -209,10 +204,9 @@ class TestOtherFiles:
         times = {path: path.stat().st_mtime_ns for path in files_of(copy)}
         cut.write_bytes(cut.read_bytes()[:-200])
         foreign.write_bytes((tmp_path / "other" / foreign.name).read_bytes())
-        named = f"{cut.name}: cut off.*{foreign.name}: of another study"
-        with pytest.raises(ValueError, match=named):
-            run_study(small_study(NUM_CELLS), copy, resume=True)
-        for path in (cut, foreign):
+        for path, fault in ((cut, "cut off"), (foreign, "of another study")):
+            with pytest.raises(ValueError, match=f"{path.name}: {fault}"):
+                run_study(small_study(NUM_CELLS), copy, resume=True)
             path.unlink()
         np.testing.assert_equal(run_study(small_study(NUM_CELLS), copy, resume=True), alone[1])
         again = [path for path, time in times.items() if path.stat().st_mtime_ns != time]

@@ -109,7 +109,6 @@ TAKEN = {
     "ospa": (lambda x: metrics.ospa(x, OTHERS, cutoff=3.0), [[1, 6], [0, 3]]),
     "gospa": (lambda x: metrics.gospa(OTHERS, x, cutoff=3.0), [[1, 6], [0, 3]]),
     "expectation": (MIXTURE.expectation, [0, 100, 200, 255]),
-    "component_sums": (MIXTURE.component_sums, [0, 100, 200, 255]),
     "Detections": (
         lambda x: np.asarray(Detections.of(x, "boxes").boxes),
         [[2.0, 3.0, 4.0, 5.0], [6.0, 1.0, 2.0, 2.0]],

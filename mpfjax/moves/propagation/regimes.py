@@ -19,9 +19,8 @@ from mpfjax.moves.resampling.line import Line, in_line
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.logarithms import log_or_nothing
 from mpfjax.operations.random import uniform
-from mpfjax.operations.rows import select_rows
 from mpfjax.operations.segments import spread
-from mpfjax.operations.stored import take
+from mpfjax.operations.stored import select_rows, take
 
 
 class RegimeProposal(AbstractProposal):

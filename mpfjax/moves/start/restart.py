@@ -25,8 +25,7 @@ from mpfjax.moves.start.sampler import (
 from mpfjax.operations.islands import num_islands, over_islands
 from mpfjax.operations.logarithms import default_float, finite_or_zero, log_sum_exp
 from mpfjax.operations.random import split
-from mpfjax.operations.rows import select_rows
-from mpfjax.operations.stored import cond_if_any, take
+from mpfjax.operations.stored import cond_if_any, select_rows, take
 
 # In the memory.
 RECENT = "the last observations"

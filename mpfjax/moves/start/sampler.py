@@ -31,8 +31,7 @@ from mpfjax.operations.logarithms import (
     log_sum_exp,
 )
 from mpfjax.operations.random import bits, normal, split, uniform
-from mpfjax.operations.rows import select_rows
-from mpfjax.operations.stored import take
+from mpfjax.operations.stored import select_rows, take
 
 # Paths of the pilot for each of the sample.
 PILOT = 1 / 5

@@ -12,13 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mpfjax.checks import (
-    Count,
-    Positive,
-    checked,
-    warn,
-)
-from mpfjax.extras import optional
+from mpfjax.checks import Count, Positive, checked, optional, warn
 from mpfjax.vision.files.sequences import read_sequence_info
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")

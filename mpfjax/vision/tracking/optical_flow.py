@@ -8,7 +8,7 @@ import numpy as np
 from mpfjax.arrays import (
     to_rows,
 )
-from mpfjax.extras import optional
+from mpfjax.checks import optional
 from mpfjax.vision.files.frames import of_one_kind
 from mpfjax.vision.tracking.gaussian import CameraMotion
 

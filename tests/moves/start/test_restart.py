@@ -303,14 +303,3 @@ def test_the_evidence_is_that_of_the_prior_beside_the_increment(told):
     run, _ = told["alarm", False]
     found = run.log_evidence_against_start + run.log_likelihood_increments
     np.testing.assert_allclose(found, -np.log(40), atol=0.4)
-
-
-@pytest.mark.exactness
-def test_collect_sees_the_time_and_the_inputs():
-    def collect(mixture, t, inputs):
-        return t, inputs
-
-    filter = mpfjax.particle_filter(MODEL, 60)
-    times, inputs = mpfjax.run_filter(KEY, filter, SCALARS, collect).collected
-    np.testing.assert_array_equal(times, [1, 2, 3, 4, 5])
-    assert inputs is None
