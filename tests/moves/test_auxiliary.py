@@ -9,6 +9,7 @@ import pytest
 import mpfjax
 from mpfjax import AuxiliaryResample, GaussNewtonProposal, Resample
 from mpfjax.exact import kalman_filter
+from mpfjax.operations.segments import segment_sum
 from tests.examples import make_mixture
 from tests.unbiased import assert_unbiased, ratios_to
 
