@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.lookahead.quadratics import LocalQuadratics
-from mpfjax.mixture import ParticleMixture, flatten_states
+from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import check_moved
 from mpfjax.models.law import law_of
 from mpfjax.models.noise import draw_noise, noise_dtype
@@ -38,7 +38,7 @@ class Twist(AbstractLookahead):
 
     steps: LocalQuadratics
     initial: LocalQuadratics | None
-    features: Callable[[PyTree], Array] = flatten_states
+    features: Callable[[PyTree], Array]
 
     def at(self, t: Int[Array, ""]) -> LocalQuadratics:
         """ψ_t."""
@@ -66,7 +66,7 @@ class TwistInitial(AbstractMove):
     """
 
     twist: Twist
-    noise: str = eqx.field(static=True, default="independent")
+    noise: str = eqx.field(static=True)
 
     approximate = False
 

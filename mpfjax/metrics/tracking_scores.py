@@ -19,6 +19,7 @@ _SETTINGS = {"THRESHOLD": 0.5, "PRINT_CONFIG": False}
 def multi_object_scores(
     tracks: Float[np.ndarray, "r 6"],
     truth: Float[np.ndarray, "s 6"],
+    frames: tuple[int, int] | None = None,
     *,
     ignored: Float[np.ndarray, "i 6"] | None = None,
     min_height: NotNegative = 0.0,
@@ -26,9 +27,10 @@ def multi_object_scores(
     """Score tracks against the true boxes as TrackEval does, by the overlap of boxes (IoU).
 
     Both are rows (frame, id, x, y, w, h) as in MOTChallenge files, (x, y) the top-left corner, in
-    pixels. Every frame in which either has a box counts. `ignored` and `min_height` are the
-    arguments of `remove_ignored`, which is called first; `read_truth` of `mpfjax.vision` reads all
-    three. The scores:
+    pixels. `frames` is the first and the last frame to score; rows outside are ignored. Without it
+    every frame in which either has a box counts. `ignored` and `min_height` are the arguments of
+    `remove_ignored`, which is called first; `read_truth` of `mpfjax.vision` reads all three. The
+    scores:
 
     - "HOTA", "DetA" and "AssA", Luiten et al. (2021), each the mean over IoU thresholds of 0.05 to
       0.95;
@@ -42,6 +44,11 @@ def multi_object_scores(
     the extra "trackeval". Use it to compare with published trackers.
     """
     tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
+    if frames is not None:
+        first, last = frames
+        tracks, truth = (
+            rows[(first <= rows[:, 0]) & (rows[:, 0] <= last)] for rows in (tracks, truth)
+        )
     if len(truth) == 0:
         raise ValueError("truth: there are no true boxes to score against")
     ignored = np.zeros((0, 6)) if ignored is None else ignored

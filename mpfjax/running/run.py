@@ -20,9 +20,8 @@ from mpfjax.running.devices import (
     over_threads,
 )
 from mpfjax.running.diagnosis import sound, warn_of_start
-from mpfjax.running.keys import initial_keys
 from mpfjax.running.results import FilterRun
-from mpfjax.running.scan import first_mixture, scan
+from mpfjax.running.scan import first_mixture, initial_keys, scan
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
 # have a row of particles each, which counts as so many times the particles.

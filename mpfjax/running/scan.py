@@ -14,8 +14,8 @@ from mpfjax.memory import check_run
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.series import Series
 from mpfjax.operations.islands import num_islands
+from mpfjax.operations.random import split
 from mpfjax.report import StepInfo
-from mpfjax.running.keys import split_for_run
 from mpfjax.running.results import FilterRun
 
 
@@ -27,8 +27,9 @@ def scan(
     initial: ParticleMixture | None = None,
 ) -> FilterRun:
     """`run_filter` under the caller's jit, its arguments unchecked, from an `initial` mixture."""
-    num_initial, num_moves = 1 + len(filter.initial_moves), len(filter.moves)
-    keys_initial, keys = split_for_run(key, num_initial, series.length, num_moves)
+    step_keys = split(split(key, 2)[1], series.length)
+    # Not by `vmap`, under which keys of some generators are split differently.
+    keys = jax.lax.map(lambda key: split(key, len(filter.moves)), step_keys)
 
     def advance(
         mixture: ParticleMixture, step: tuple[Array, Series]
@@ -40,10 +41,15 @@ def scan(
         return mixture, (values, report_of(info))
 
     if initial is None:
-        initial = first_mixture(keys_initial, filter, series)
+        initial = first_mixture(initial_keys(key, filter), filter, series)
     check_run(initial.memory, series.length)
     final, outputs = jax.lax.scan(advance, initial, (keys, series))
     return run_of(initial, final, *outputs)
+
+
+def initial_keys(key: Key[Array, ""], filter: Filter) -> Key[Array, " i"]:
+    """The keys with which a run with this key draws and moves x_0."""
+    return split(split(key, 2)[0], 1 + len(filter.initial_moves))
 
 
 def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> ParticleMixture:

@@ -18,9 +18,8 @@ from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Referenc
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.random import split, uniform
 from mpfjax.running.diagnosis import sound
-from mpfjax.running.keys import initial_keys
 from mpfjax.running.results import FilterRun
-from mpfjax.running.scan import scan
+from mpfjax.running.scan import initial_keys, scan
 from mpfjax.smoothing.backward import draw, log_transitions
 from mpfjax.smoothing.history import ancestors_of, mixtures_of, paths_through
 from mpfjax.smoothing.trajectories import draw_trajectories

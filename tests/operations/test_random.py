@@ -18,7 +18,6 @@ from mpfjax.operations.random import (
     threefry,
     uniform,
 )
-from mpfjax.running.keys import split_for_run
 from tests.marking import quick_of
 from tests.precision import float64
 
@@ -55,15 +54,9 @@ def test_the_same_bits_alone_and_under_jit_and_vmap(name):
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])
-def test_keys_of_a_run_are_those_of_one_split_after_the_other(impl):
+def test_a_split_that_is_stored_is_the_same(impl):
     key = jax.random.key(3, impl=impl)
     same_keys(jax.jit(split_once, static_argnums=1)(key, 7), jax.random.split(key, 7))
-    key_initial, key_steps = jax.random.split(key)
-    initial, moves = jax.jit(lambda key: split_for_run(key, 2, 7, 3))(key)
-    same_keys(initial, jax.random.split(key_initial, 2))
-    assert moves.shape == (7, 3)
-    for found, step_key in zip(moves, jax.random.split(key_steps, 7), strict=True):
-        same_keys(found, jax.random.split(step_key, 3))
 
 
 def test_other_settings_and_generators_are_left_alone():

@@ -25,7 +25,7 @@ FLOORS = {
     "lookahead": "quadratics pilot twisted regression learned",
     "robots": "maps motion sensors localisation pose",
     "running": """
-        storage long_runs devices results keys scan diagnosis run islands studies
+        storage long_runs devices results scan diagnosis run islands studies
     """,
 }
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
