@@ -102,7 +102,7 @@ def tests(session: nox.Session) -> None:
 
 @nox.session(python=sys.executable)
 def weekly(session: nox.Session) -> None:
-    """Hostile calls, kills, several processes, notebooks, the gallery, all benchmarks."""
+    """Hostile calls, several processes, notebooks, the gallery, all benchmarks."""
     session.install("-e", ".[test]")
     session.run("python", "-m", "pytest", "-m", "weekly", *session.posargs)
 

@@ -51,54 +51,41 @@ class Memory(eqx.Module):
         return ""
 
 
+def memories_of(memory: dict[str, PyTree]) -> dict[str, Memory]:
+    """The entries that follow the particles, by name."""
+    return {name: entry for name, entry in memory.items() if isinstance(entry, Memory)}
+
+
 def reference_slot(memory: dict[str, PyTree]) -> Int[Array, ""] | None:
     """The slot of the reference particle in the first memory that has one."""
-    for entry in memory.values():
-        if isinstance(entry, Memory) and (slot := entry.reference_slot()) is not None:
-            return slot
-    return None
+    slots = [entry.reference_slot() for entry in memories_of(memory).values()]
+    return next((slot for slot in slots if slot is not None), None)
 
 
 def after_resampling(before: Any, after: Any, offspring: Offspring) -> Any:
     """The redrawn mixture, whose memories have followed."""
-    for name, entry in before.memory.items():
-        if isinstance(entry, Memory):
-            entry = entry.after_resampling(before, after, offspring)
-            after = after.replace(memory=after.memory | {name: entry})
+    for name, entry in memories_of(before.memory).items():
+        entry = entry.after_resampling(before, after, offspring)
+        after = after.replace(memory=after.memory | {name: entry})
     return after
-
-
-def check_run(memory: dict[str, PyTree], num_steps: int) -> None:
-    """Raise a `ValueError` for a run of fewer steps than a memory needs."""
-    for entry in memory.values():
-        if isinstance(entry, Memory):
-            entry.check_run(num_steps)
 
 
 def check_past(memory: dict[str, PyTree]) -> None:
     """Raise a `ValueError` for a memory by which a run cannot be smoothed."""
-    for entry in memory.values():
-        if isinstance(entry, Memory):
-            entry.check_past()
-
-
-def warnings_of(memory: dict[str, PyTree]) -> list[str]:
-    """What a run that ends with these memories has to warn of."""
-    texts = [entry.warning() for entry in memory.values() if isinstance(entry, Memory)]
-    return [text for text in texts if text]
+    for entry in memories_of(memory).values():
+        entry.check_past()
 
 
 def at_start(mixture: Any) -> Any:
     """The mixture, whose memories are those of particles without a past."""
-    new = {k: v.at_start(mixture) for k, v in mixture.memory.items() if isinstance(v, Memory)}
+    new = {name: entry.at_start(mixture) for name, entry in memories_of(mixture.memory).items()}
     return mixture.replace(memory=mixture.memory | new) if new else mixture
 
 
 def after_step(mixture: Any, now: Any) -> tuple[Any, dict[str, PyTree]]:
     """The mixture with its memories after the step, and what they add to the step's report."""
     report: dict[str, PyTree] = {}
-    for name, entry in mixture.memory.items():
-        if isinstance(entry, Memory):
-            entry, added = entry.after_step(mixture, now)
-            mixture, report = mixture.replace(memory=mixture.memory | {name: entry}), report | added
+    for name, entry in memories_of(mixture.memory).items():
+        entry, added = entry.after_step(mixture, now)
+        mixture, report = mixture.replace(memory=mixture.memory | {name: entry}), report | added
     return mixture, report

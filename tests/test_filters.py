@@ -11,17 +11,13 @@ import pytest
 
 import mpfjax
 from mpfjax import Filter, Propagate, Resample
-from mpfjax.exact import kalman_filter
 from tests.registry import CHAINS
-from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import (
     BLINDED,
     BROKEN,
-    DRIFT_AS_LINEAR_GAUSSIAN,
     Drift,
     DriftOfOne,
     TrickyQuadraticModel,
-    TwoSensors,
     nothing_traced,
 )
 
@@ -60,26 +56,6 @@ def test_collect_decides_what_is_kept():
     np.testing.assert_allclose(found, means.collected, rtol=1e-4, atol=1e-6)
     last = jax.tree.map(lambda leaf: leaf[-1], whole.collected)
     chex.assert_trees_all_equal(last, whole.final)
-
-
-@pytest.mark.exactness
-def test_three_methods_are_enough_for_any_pytree_of_states_and_observations():
-    class Minimal(mpfjax.AbstractStateSpaceModel):
-        def sample_initial(self, key, num_particles):
-            return {"x": jax.random.normal(key, (num_particles,))}
-
-        def sample_transition(self, key, states):
-            return {"x": states["x"] + jax.random.normal(key, states["x"].shape)}
-
-        def log_likelihood(self, observation, states):
-            return jnp.where(observation["seen"], -0.5 * (observation["y"] - states["x"]) ** 2, 0.0)
-
-    filter = Filter(Minimal(), [Resample(), Propagate()], 30, 3)
-    seen = {"y": OBSERVATIONS, "seen": jnp.array([True, False, True, True])}
-    run = mpfjax.run_filter(KEY, filter, seen, mean)
-    assert run.collected["x"].shape == (4,)
-    np.testing.assert_allclose(run.log_likelihood_increments[1], 0.0, atol=1e-6)
-    assert np.isfinite(run.log_marginal_likelihood)
 
 
 @pytest.mark.exactness
@@ -129,33 +105,6 @@ def test_resampling_is_reported_where_it_happens():
     np.testing.assert_array_equal(run.resampled[:, 0], due)
     moved = (np.asarray(run.collected.ancestor_indices) != np.arange(48)).any(axis=1)
     np.testing.assert_array_equal(moved, due)
-
-
-BOTH = eqx.tree_at(
-    lambda model: (model.H, model.R), DRIFT_AS_LINEAR_GAUSSIAN, (jnp.eye(2), 0.49 * jnp.eye(2))
-)
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize(
-    ("model", "linear", "observations"),
-    [
-        (TwoSensors(), BOTH, [[1.0, np.nan], [np.nan, 0.3], [0.4, 0.1]]),
-        (LINEAR, LINEAR, [[1.0], [np.nan], [0.3]]),
-    ],
-    ids=["one of two sensors", "a step"],
-)
-def test_what_is_missing_is_skipped_as_the_kalman_filter_does(model, linear, observations):
-    filter, observations = mpfjax.particle_filter(model, 500), np.array(observations, np.float32)
-    keys = jax.random.split(KEY, 400)
-    run = mpfjax.monte_carlo(keys, filter, mpfjax.Series.skipping(observations), mean)
-    exact = kalman_filter(linear, mpfjax.Series.skipping(observations))
-    ratios = ratios_to(exact, run)
-    assert_unbiased(ratios, loosest=0.03)
-    assert_unbiased(ratios[:, None] * np.asarray(run.collected)[:, -1], exact.means[-1])
-    nothing_seen = np.isnan(observations).all(axis=1)
-    assert (np.asarray(run.log_likelihood_increments)[:, nothing_seen] == 0).all()
-    assert not np.asarray(run.resampled)[:, nothing_seen].any()
 
 
 @pytest.mark.exactness

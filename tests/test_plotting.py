@@ -50,14 +50,6 @@ def test_components_stand_where_their_moments_are(run):
     assert len(bars) == np.sum(masses >= 0.01) < np.sum(masses > 0)
 
 
-def test_a_weight_that_rounding_left_above_one_is_drawn():
-    filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 10)
-    mixtures = mpfjax.run_filter(jax.random.key(0), filter, np.ones(2, np.float32)).collected
-    mixtures = eqx.tree_at(lambda m: m.log_weights, mixtures, mixtures.log_weights + 1e-6)
-    assert np.all(jax.vmap(lambda mixture: mixture.mixture_weights)(mixtures) > 1)
-    assert plotting.draw_components(mixtures).collections
-
-
 def test_the_plane_has_an_ellipse_for_each_component_and_step(run, ax):
     assert plotting.draw_plane(run, (1, 0), ax=ax) is ax
     masses = np.asarray(jax.vmap(lambda mixture: mixture.mixture_weights)(run.collected))

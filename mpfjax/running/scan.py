@@ -10,7 +10,7 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import saying
 from mpfjax.filter import Filter
-from mpfjax.memory import check_run
+from mpfjax.memory import memories_of
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.series import Series
 from mpfjax.operations.islands import num_islands
@@ -42,7 +42,8 @@ def scan(
 
     if initial is None:
         initial = first_mixture(initial_keys(key, filter), filter, series)
-    check_run(initial.memory, series.length)
+    for entry in memories_of(initial.memory).values():
+        entry.check_run(series.length)
     final, outputs = jax.lax.scan(advance, initial, (keys, series))
     return run_of(initial, final, *outputs)
 

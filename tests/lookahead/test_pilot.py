@@ -1,13 +1,11 @@
 """The look-ahead from a model's own noise; for unbiased Ẑ see `tests/together/test_chains.py`."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mpfjax
-from benchmarks.masses.models import Mirror
 from mpfjax.lookahead.pilot import PilotLookahead
 from tests.examples import make_mixture
 
@@ -49,21 +47,6 @@ def test_where_a_step_is_narrow_three_quarters_of_the_likelihood_are_trusted():
     found = ahead(mpfjax.QuadraticModel(1e-4, 1.0), jnp.float32(1.0), states, np.full(50, 1 / 50))
     likelihoods = np.exp(-0.5 * (1.0 - np.linspace(0.0, 4.0, 50) ** 2) ** 2)
     np.testing.assert_allclose(found, 1 / 4 + 3 / 4 * likelihoods / likelihoods.mean(), rtol=1e-2)
-
-
-@pytest.mark.weekly
-def test_it_lowers_the_mean_squared_error_of_log_z_on_the_mirror_image():
-    """With keys that nothing was chosen on; a third of the variance is expected."""
-    model, num_runs = Mirror(), 120
-    observations = model.simulate(40, 0)
-    keys = jax.random.split(jax.random.key(77), num_runs)
-    plain = mpfjax.with_quasi_monte_carlo(mpfjax.mixture_particle_filter(model, 400, 4))
-    before, after = (
-        np.var(mpfjax.monte_carlo(keys, filter, observations).log_marginal_likelihood)
-        for filter in (plain, mpfjax.with_lookahead(plain))
-    )
-    error_of_the_log = np.sqrt(2 * 2 / num_runs)
-    assert np.log(after / before) < -2 * error_of_the_log
 
 
 @pytest.mark.parametrize("noise", ["rqmc", "independent"])

@@ -99,28 +99,6 @@ def test_empty_sets():
     np.testing.assert_allclose(false, [7.0, 0, 0, 7.0], rtol=1e-6)
 
 
-@pytest.mark.exactness
-def test_distances_far_below_the_cutoff_pair_as_well():
-    """Beside the power of the cutoff theirs would be lost in float32."""
-    rng, pairs, cutoff, order = np.random.default_rng(0), [], 5000.0, 2.0
-    for num_far in (0, 0, 1, 1, 2):
-        truths = rng.uniform(0.0, 3.0, (4, 2))
-        estimates = truths[rng.permutation(4)] + rng.normal(0.0, 0.7, (4, 2))
-        estimates[:num_far] += 1e4
-        pairs.append((estimates.astype(np.float32), truths.astype(np.float32)))
-    found = of_each(gospa, pairs, cutoff=cutoff, exponent=order)
-    some = of_each(ospa, pairs, cutoff=cutoff, exponent=order)
-    pairs = [(x.astype(float), y.astype(float)) for x, y in pairs]
-    best = [every_pairing(*pair, cutoff, order, 0.0) for pair in pairs]
-    np.testing.assert_allclose(found.distance, np.power(best, 1 / order), rtol=2e-5)
-    np.testing.assert_allclose(some.distance, np.power(np.divide(best, 4), 1 / order), rtol=2e-5)
-    apart = [every_pairing(x[x[:, 0] < 1e3], y, cutoff, order, 0.0) for x, y in pairs]
-    np.testing.assert_allclose(found.localisation, apart, rtol=2e-4)
-    num_far = np.array([0, 0, 1, 1, 2])
-    for part in (found.missed, found.false):
-        np.testing.assert_allclose(part[num_far == 0], 0.0)
-
-
 def test_switches_are_counted_where_an_object_has_another_label_than_before():
     """Two objects at 0 and 10: a swap is two, a gap none, a new label after a gap one."""
     nan = np.nan

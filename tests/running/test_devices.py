@@ -26,7 +26,6 @@ from tests import on_devices
 from tests.examples import make_mixture
 from tests.precision import float64
 from tests.unbiased import assert_unbiased
-from tests.user_models import TrickyQuadraticModel
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NUM_ISLANDS = on_devices.NUM_ISLANDS
@@ -131,25 +130,6 @@ class TestIslands:
                 assert dead[0].any()
                 assert (dead[1:] >= dead[:-1]).all()
         assert (dead[:-1] & ~dead[1:]).any()
-
-    @pytest.mark.exactness
-    def test_a_constant_moves_the_evidence_and_nothing_else(self):
-        """Every island has a scale of its own, beside which none may be rounded away."""
-
-        def run(constant, taken_off):
-            model = TrickyQuadraticModel(0.3, 0.5, constant=constant, taken_off=taken_off)
-            return mpfjax.run_islands(
-                jax.random.key(1), exchanging(model), OBSERVATIONS, num_islands=4
-            )
-
-        for constant in map(np.float32, (1e3, -1e30)):
-            with_it, without = run(constant, np.float32(0)), run(constant, constant)
-            assert float(with_it.final.weights.sum()) == pytest.approx(1, rel=1e-5)
-            size = with_it.effective_sample_size[-1]
-            np.testing.assert_allclose(size, with_it.final.effective_sample_size, rtol=1e-4)
-            np.testing.assert_allclose(with_it.final.weights, without.final.weights, atol=1e-7)
-            increments = without.log_likelihood_increments + constant
-            np.testing.assert_allclose(with_it.log_likelihood_increments, increments, rtol=1e-6)
 
     def test_slots_that_cannot_be_dealt_evenly(self):
         filter = mpfjax.Filter(MODEL, [IslandInteraction(), mpfjax.Propagate()], 13)

@@ -1,10 +1,6 @@
 """A study that is broken off, however it is, ends as one that was left alone."""
 
-import errno
-import multiprocessing
 import shutil
-import signal
-import time
 
 import jax
 import numpy as np
@@ -12,11 +8,36 @@ import pytest
 
 import mpfjax
 from mpfjax import read_study, run_study
-from tests.full_disk import no_room_beyond
-from tests.small_study import OBSERVATIONS, build, mean, measure, run_in_process, small_study
 from tests.user_models import TrickyQuadraticModel, nothing_traced
 
 NUM_CELLS = 5
+OBSERVATIONS = np.array([1.5, 1.0, 0.4], np.float32)
+
+
+def build(num_particles, noise):
+    return mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, noise, -2.0, 2.0), num_particles)
+
+
+def mean(mixture):
+    return mixture.mean()
+
+
+def measure(run):
+    return {"evidence": run.log_marginal_likelihood, "means": run.collected}
+
+
+def small_study(num_cells=5, **changes):
+    """Cells that differ in a number only, so that all of them are one program."""
+    arguments = {
+        "filters": {"pf": build},
+        "num_particles": [8],
+        "keys": jax.random.split(jax.random.key(0), 4),
+        "observations": OBSERVATIONS,
+        "settings": {"noise": np.linspace(0.1, 1.0, num_cells)},
+        "measure": measure,
+        "collect": mean,
+    }
+    return mpfjax.Study(**arguments | changes)
 
 
 def contents(directory):
@@ -113,59 +134,6 @@ class TestBrokenOff:
         np.testing.assert_equal(run_study(study, tmp_path, resume=True), alone[1])
         assert all(path.stat().st_mtime_ns == time for path, time in finished.items())
 
-    @pytest.mark.weekly
-    def test_ten_times_by_sigkill_it_ends_as_if_left_alone(self, tmp_path):
-        """Each process is forked off one that has imported everything, which takes longest."""
-        num_cells, rng = 80, np.random.default_rng(0)
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["tests.small_study"])
-
-        def start(directory):
-            arguments = (directory, num_cells, tmp_path / "compiled")
-            process = context.Process(target=run_in_process, args=arguments)
-            process.start()
-            return process
-
-        def finish(directory):
-            process = start(directory)
-            process.join()
-            assert process.exitcode == 0
-
-        finish(tmp_path / "alone")
-        killed = tmp_path / "killed"
-        finished, start_up = [], 0.0
-        for k in range(10):
-            began, process = time.monotonic(), start(killed)
-            # Every third dies while it starts, the others while they run or write a cell.
-            starts = k % 3 == 2
-            wanted = len(files_of(killed)) + rng.integers(1, 5)
-            until = began + (rng.uniform(0, start_up) if starts else 60)
-            while len(files_of(killed)) < wanted and time.monotonic() < until:
-                time.sleep(0.001)
-            if not starts:
-                start_up = time.monotonic() - began
-                time.sleep(rng.uniform(0, 0.01))
-            process.kill()
-            process.join()
-            assert process.exitcode == -signal.SIGKILL
-            finished.append(len(files_of(killed)))
-        assert finished == sorted(finished)
-        assert 6 < finished[-1] < num_cells
-        finish(killed)
-        assert contents(killed) == contents(tmp_path / "alone")
-
-    def test_a_full_disk_keeps_what_was_finished(self, alone, copy, capsys):
-        missing = files_of(copy)[3:]
-        for path in missing:
-            path.unlink()
-        before = contents(copy)
-        for room in (0, 300):
-            with pytest.raises(OSError, match=missing[0].name) as info, no_room_beyond(room):
-                run_study(small_study(NUM_CELLS), copy, resume=True)
-            assert info.value.errno == errno.EFBIG
-            assert contents(copy) == before
-        np.testing.assert_equal(run_study(small_study(NUM_CELLS), copy, resume=True), alone[1])
-
 
 class TestOtherFiles:
     @pytest.mark.parametrize(
@@ -211,10 +179,6 @@ class TestOtherFiles:
         np.testing.assert_equal(run_study(small_study(NUM_CELLS), copy, resume=True), alone[1])
         again = [path for path, time in times.items() if path.stat().st_mtime_ns != time]
         assert again == [cut, foreign]
-
-    def test_without_a_folder_there_are_no_results(self, tmp_path):
-        with pytest.raises(FileNotFoundError):
-            read_study(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(
