@@ -359,5 +359,5 @@ def test_rows_are_selected_whole_whatever_their_axes():
     chosen, matrices = np.array([True, False, True]), RNG.normal(size=(3, 2, 4))
     for new in (jnp.arange(1.0, 4.0), jnp.asarray(matrices)):
         found = select_rows(jnp.asarray(chosen), new, -new)
-        np.testing.assert_array_equal(found[[0, 2]], new[np.array([0, 2])])
+        np.testing.assert_array_equal(found[chosen], new[chosen])
         np.testing.assert_array_equal(found[1], -new[1])

@@ -90,11 +90,6 @@ def refused(names_of_tree, is_wrong, allowed):
     ]
 
 
-def test_the_rule_knows_participles():
-    assert all(map(is_participle, ["_joined", "updated", "seen", "told_of_start", "padded"]))
-    assert not any(map(is_participle, ["smoothed_sums", "padded_rows", "seed_of", "_normalised"]))
-
-
 def test_names_are_no_participles():
     wrong = refused(names_of, lambda name: name.strip("_") in PARTICIPLES.split(), ALLOWED_NAMES)
     assert not wrong

@@ -35,24 +35,6 @@ def test_requirements_have_lower_bounds_and_errors_name_extras():
     assert set(hints) <= known
 
 
-@pytest.mark.parametrize(
-    ("message", "says"),
-    [
-        ("docs: shorten the guides\n\nA body may be of any length " + "x" * 80, ""),
-        ("Merge branch 'docs'", ""),
-        ("shorten the guides", "part: "),
-        ("docs: " + "x" * 67, "73 characters"),
-    ],
-)
-def test_the_commit_hook_judges_the_subject_alone(message, says, tmp_path):
-    file = tmp_path / "message"
-    file.write_text(message, encoding="utf-8")
-    hook = [sys.executable, ROOT / ".ci" / "commit_message.py", file]
-    done = subprocess.run(hook, capture_output=True, text=True)
-    assert (done.returncode != 0) == bool(says), done.stderr
-    assert says in done.stderr
-
-
 @pytest.mark.exactness
 def test_the_import_brings_what_a_first_filter_needs_and_the_rest_later():
     """In a new process, as a user's: without the tests' conftest."""
