@@ -1,5 +1,7 @@
 """The report of a step of a filter."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -70,7 +72,7 @@ def report_of(mixture: ParticleMixture, **additions: Array) -> StepInfo:
     squares = jnp.sum(jnp.exp(2 * jax.lax.stop_gradient(mixture.log_weights)))
     sizes = mixture.component_effective_sample_sizes
     increment = mixture.within.log_increment
-    fields = {
+    fields: dict[str, Any] = dict.fromkeys(_BY_MEMORIES) | {
         "log_likelihood_increment": increment,
         "effective_sample_sizes": sizes,
         "effective_sample_size": 1 / squares,
@@ -79,7 +81,7 @@ def report_of(mixture: ParticleMixture, **additions: Array) -> StepInfo:
         "degenerate": increment == -jnp.inf,
         "labels_ran_out": jnp.all(sizes > 0) & (mixture.num_components > 1),
     }
-    return StepInfo(**fields | dict.fromkeys(_BY_MEMORIES) | additions)
+    return StepInfo(**fields | additions)
 
 
 def with_densities(value: PyTree, increments: Float[Array, "*runs_and_t"]) -> PyTree:

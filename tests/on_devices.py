@@ -52,7 +52,8 @@ def leaves(**runs):
 def main(file):
     jax.config.update("jax_enable_x64", True)
     assert len(jax.devices()) == 8
-    np.savez(file, **leaves(replicates=replicates(), islands=islands()))
+    runs = leaves(replicates=replicates(), islands=islands())
+    np.savez(file, **runs)  # pyright: ignore[reportArgumentType]
 
 
 if __name__ == "__main__":
