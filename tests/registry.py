@@ -33,7 +33,6 @@ from mpfjax import (
 )
 from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.moves.objects.clusters import PropagateInClusters
-from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.moves.resampling.gaussian import RegenerateObjects
 
@@ -167,11 +166,6 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         "split only, adaptive": _chain(Resample(ess_threshold=0.5), m=m, then=[Split(2.0)]),
         "random labels, stratified": _chain(RandomLabels(), Resample("stratified"), m=m),
         "gaussian mixture": _chain(GaussianRegeneration(), m=m, then=[KMeans()]),
-        "exclusion": _chain(
-            Resample("stratified"),
-            m=m,
-            then=[Exclusion(strength=2.0, radius=0.5), KMeans(3, reseed=True)],
-        ),
         "partitioned in clusters": _joint(
             lambda joint: Filter(
                 joint,
@@ -215,10 +209,6 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "guided mpf rqmc of families": lambda model: mpfjax.with_proposals_per_particle(
         _mpf(proposal=GaussNewtonProposal(), noise="rqmc")(model), 3
     ),
-    "predict and weigh": lambda model: Filter(
-        model, [Resample(), Predict(), Reweight()], NUM_PARTICLES
-    ),
-    "joint pf": _joint(_pf()),
     "ps adaptive, random order": _joint(
         lambda joint: mpfjax.map_moves(
             mpfjax.partitioned_sampling(joint, NUM_PARTICLES, "random"),
@@ -234,13 +224,6 @@ CHAINS: dict[str, Callable[..., Filter]] = {
             joint, NUM_PARTICLES, reassembly="evidence"
         )
     ),
-    "dps prior": _joint(
-        lambda joint: mpfjax.distributed_partitioned_sampling(joint, NUM_PARTICLES)
-    ),
-    "independent filters": _joint(
-        lambda joint: mpfjax.independent_particle_filters(joint, NUM_PARTICLES)
-    ),
-    "clusters": _joint(lambda joint: mpfjax.clustered_particle_filter(joint, NUM_PARTICLES)),
     "objects that cross in one cluster": _joint(
         lambda joint: mpfjax.Filter(joint, [PropagateInClusters("together")], NUM_PARTICLES)
     ),
