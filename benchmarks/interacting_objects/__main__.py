@@ -24,12 +24,19 @@ from benchmarks.interacting_objects import scenes as made
 from benchmarks.interacting_objects.partitions import adaptive_partitions as adaptive
 from benchmarks.interacting_objects.scenes import BOX, NUM_FRAMES, SCENES, SHARPNESS, Scene
 from benchmarks.tracking_quality import recovery_rate, track_state
+from mpfjax.moves.objects.clusters import PropagateInClusters
 
 REPULSION = 2 * SHARPNESS  # so that sharing a place never pays; none from a box's side on
 RUNS_AT_ONCE = 20
 NUM_LAST = 3  # frames at the end in which who has recovered is tracked
 
-clusters, dps = mpfjax.clustered_particle_filter, mpfjax.distributed_partitioned_sampling
+
+def one_cluster(model: mpfjax.MultiObjectModel, num_particles: int) -> mpfjax.Filter:
+    """The filter of clusters, with all objects in one from the start."""
+    return mpfjax.Filter(model, [PropagateInClusters("together")], num_particles)
+
+
+dps = mpfjax.distributed_partitioned_sampling
 METHODS: dict[str, tuple[str, Callable[..., mpfjax.Filter]]] = {
     "joint": ("joint PF", mpfjax.particle_filter),
     "ps": ("PS, mean of orders", mpfjax.partitioned_sampling),
@@ -40,8 +47,8 @@ METHODS: dict[str, tuple[str, Callable[..., mpfjax.Filter]]] = {
     "adaptive": ("adaptive partitions", adaptive),
     # Five points in each row, so up to five times the likelihoods.
     "adaptive_draws": ("adaptive partitions, K = 5", partial(adaptive, num_draws=5)),
-    "crossing": ("one cluster", partial(clusters, start="together")),
-    "clusters": ("clusters", clusters),
+    "crossing": ("one cluster", one_cluster),
+    "clusters": ("clusters", mpfjax.clustered_particle_filter),
     # Clusters that part after five steps without contact, an approximation.
 }
 ONE_BY_ONE = ("crossing", "clusters")
