@@ -55,8 +55,6 @@ class KalmanSmootherRun(eqx.Module):
     """E[x_s | y_1..y_t] for s = 0, ..., t."""
     covariances: Float[Array, "t d d"]
     """Cov[x_s | y_1..y_t] for s = 0, ..., t."""
-    lagged_covariances: Float[Array, "s d d"]
-    """Cov[x_s, x_{s-1} | y_1..y_t] for s = 1, ..., t, which EM needs."""
     log_marginal_likelihood: Float[Array, ""]
 
 
@@ -124,8 +122,8 @@ def _kalman_filter(constant, observations, inputs):
 def _smooth(constant, observations, inputs):
     start, step_of = _initial_law_and_steps(constant)
     laws, increments = filtered(start, step_of, inputs, observations)
-    moments, lagged = smoothed(start, laws, step_of, inputs)
-    return KalmanSmootherRun(*moments, lagged, jnp.sum(increments))
+    moments = smoothed(start, laws, step_of, inputs)
+    return KalmanSmootherRun(*moments, jnp.sum(increments))
 
 
 def _initial_law_and_steps(constant: LinearGaussianModel) -> tuple["Law", StepOf]:
@@ -270,16 +268,14 @@ def _solve_unit(unit: Float[Array, "m m"], right: Float[Array, "m ..."]) -> Floa
     return jax.scipy.linalg.solve_triangular(unit, right, unit_diagonal=True)
 
 
-def smoothed(
-    start: Law, laws: Law, step_of: StepOf, step_data: PyTree
-) -> tuple[Moments, Float[Array, "t d d"]]:
-    """The moments of x_0, ..., x_t given y_1..y_t, and Cov[x_s, x_{s-1}]; `laws` are filtered.
+def smoothed(start: Law, laws: Law, step_of: StepOf, step_data: PyTree) -> Moments:
+    """The moments of x_0, ..., x_t given y_1..y_t; `laws` are filtered.
 
     (x_s, x_{s+1}) is a matrix times the noises of x_s and of the dynamics.
     """
     d = start.mean.shape[0]
 
-    def back(later: Moments, earlier: tuple[Law, PyTree]) -> tuple[Moments, Any]:
+    def back(later: Moments, earlier: tuple[Law, PyTree]) -> tuple[Moments, Moments]:
         (later_mean, later_covariance), (law, now) = later, earlier
         step = step_of(now)
         units, variances = _factors(step.Q)
@@ -289,12 +285,9 @@ def smoothed(
         gain = unit[:d] @ _solve_unit(unit[d:], jnp.eye(d, dtype=unit.dtype))
         mean = law.mean + gain @ (later_mean - (step.F @ law.mean + step.b))
         covariance = _covariance(left, noise) + gain @ later_covariance @ gain.T
-        return (mean, covariance), (mean, covariance, later_covariance @ gain.T)
+        return (mean, covariance), (mean, covariance)
 
     last = jax.tree.map(lambda rows: rows[-1], laws.moments)
     earlier = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows[:-1]]), start, laws)
-    _, (*before, lagged) = jax.lax.scan(back, last, (earlier, step_data), reverse=True)
-    means, covariances = (
-        jnp.concatenate([rows, row[None]]) for rows, row in zip(before, last, strict=True)
-    )
-    return (means, covariances), lagged
+    _, before = jax.lax.scan(back, last, (earlier, step_data), reverse=True)
+    return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]]), before, last)

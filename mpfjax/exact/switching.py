@@ -123,5 +123,5 @@ def _kalman_smoother(
     d, p = model.m0.shape[-1], observations.shape[1]
     start = Law.of(of(sequence[0], model.m0, d), of(sequence[0], model.P0, d, d))
     laws, increments = filtered(start, step_of, sequence[1:], observations)
-    moments, _ = smoothed(start, laws, step_of, sequence[1:])
+    moments = smoothed(start, laws, step_of, sequence[1:])
     return laws.moments, moments, increments

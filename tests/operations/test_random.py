@@ -24,12 +24,8 @@ KEY = jax.random.key(7)
 DRAWS = {
     "normal": lambda key: jax.random.normal(key, (1000,)),
     "uniform": lambda key: jax.random.uniform(key, (129,)),
-    "bits": lambda key: jax.random.bits(key, (100,), jnp.uint32),
     "short bits": lambda key: jax.random.bits(key, (100,), jnp.uint8),
     "gamma": lambda key: jax.random.gamma(key, 2.0, (200,)),
-    "permutation": lambda key: jax.random.permutation(key, 300),
-    "categorical": lambda key: jax.random.categorical(key, jnp.arange(4.0), shape=(100,)),
-    "randint": lambda key: jax.random.randint(key, (100,), 0, 17),
     "split": lambda key: jax.random.key_data(jax.random.split(key, 5)),
     "fold_in": lambda key: jax.random.key_data(jax.random.fold_in(key, 5)),
     "a split key": lambda key: jax.random.normal(jax.random.split(key)[1], (200,)),
