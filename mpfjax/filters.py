@@ -90,8 +90,6 @@ def mixture_particle_filter(
     max_components: Count,
     *,
     proposal: AbstractProposal | None = None,
-    scheme: Scheme = "systematic",
-    ess_threshold: Share = 1.0,
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
     regroup: Sequence[AbstractMove] | None = None,
@@ -122,11 +120,10 @@ def mixture_particle_filter(
       proposal or a conditionally linear model.
     - `gradient`: "stop" is `with_score_gradient`.
 
+    `with_resampling` changes the scheme, and the sample size below which a component is resampled.
     Use it if the posterior has several modes that must all be retained.
     """
-    plain = particle_filter(
-        model, num_particles, proposal=proposal, scheme=scheme, ess_threshold=ess_threshold
-    )
+    plain = particle_filter(model, num_particles, proposal=proposal)
     options = _grouping_options(model, features, scale)
     filter = _mixture(plain, max_components, options, _WARM_ITERATIONS, regroup, regroup_every)
     if max_components > 1:

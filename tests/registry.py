@@ -147,8 +147,10 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
     return {
         "mpf": _mpf(m),
         "mpf rqmc": _mpf(m, noise="rqmc"),
-        "guided mpf rqmc, adaptive": _mpf(
-            m, proposal=GaussNewtonProposal(), noise="rqmc", ess_threshold=0.5
+        "guided mpf rqmc, adaptive": lambda model: mpfjax.with_quasi_monte_carlo(
+            mpfjax.with_resampling(
+                _mpf(m, proposal=GaussNewtonProposal())(model), Resample(ess_threshold=0.5)
+            )
         ),
         "gaussian mixture rqmc": lambda model: mpfjax.with_quasi_monte_carlo(
             mpfjax.gaussian_mixture_particle_filter(model, NUM_PARTICLES, m)

@@ -45,7 +45,9 @@ def pf(model):
 
 
 def mpf(model):
-    return mpfjax.mixture_particle_filter(model, 60, 2, ess_threshold=0.5, noise="rqmc")
+    filter = mpfjax.mixture_particle_filter(model, 60, 2)
+    resampled = mpfjax.with_resampling(filter, mpfjax.Resample(ess_threshold=0.5))
+    return mpfjax.with_quasi_monte_carlo(resampled)
 
 
 class Case(NamedTuple):
