@@ -21,7 +21,7 @@ from mpfjax.moves.every import Every
 from mpfjax.moves.objects.bernoulli import Associate
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
-from mpfjax.moves.objects.partitioned import Partitioned, Reassembly
+from mpfjax.moves.objects.partitioned import Partitioned, Reassembly, circular_orders
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import OnCircles, Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
@@ -199,16 +199,15 @@ def gaussian_mixture_particle_filter(
 def partitioned_sampling(
     model: MultiObjectModel,
     num_particles: Count,
-    order: str | Sequence[int] | Array | None = None,
+    order: Sequence[int] | Array | None = None,
 ) -> Filter:
     """Partitioned sampling: resample, then propagate one object after the other.
 
     MacCormick and Blake (1999); Smith and Gatica-Perez (2004), section 3. `order` is a permutation
-    of the objects 0, ..., J-1; None is 0, ..., J-1, and "random" a new permutation at every step.
-    It needs far fewer particles than the joint particle filter, `particle_filter` on the same
-    model, but the first objects of the order retain only a few distinct hypotheses and hardly
-    recover from an occlusion. It is unbiased for every order, also with an interaction. `map_moves`
-    changes its resampling, between steps and objects.
+    of the objects 0, ..., J-1; None is 0, ..., J-1. It needs far fewer particles than the joint
+    particle filter, `particle_filter` on the same model, but the first objects of the order retain
+    only a few distinct hypotheses and hardly recover from an occlusion. It is unbiased for every
+    order, also with an interaction. `map_moves` changes its resampling, between steps and objects.
     """
     return Filter(model, [Resample(), Partitioned(order)], num_particles)
 
@@ -217,7 +216,7 @@ def partitioned_sampling(
 def distributed_partitioned_sampling(
     model: MultiObjectModel,
     num_particles: Count,
-    orders: str | Sequence[Sequence[int]] | Array | None = None,
+    orders: Sequence[Sequence[int]] | Array | None = None,
     reassembly: Reassembly = "prior",
 ) -> Filter:
     """DPS: the particles are divided into C sets, with another order of the objects in each.
@@ -225,20 +224,15 @@ def distributed_partitioned_sampling(
     Smith and Gatica-Perez (2004), section 4: pool and resample, divide the particles into C sets at
     random, apply partitioned sampling in each, reassemble. A fixed order leaves few distinct
     hypotheses of its first objects; here all objects share this loss. `orders` are C permutations
-    of the objects; None is the J circular shifts, and "random" J new permutations at every step.
-    `reassembly` is "prior", the paper's, in which the weight of every set returns to 1/C (an
-    approximation: the marginal likelihood is biased), or "evidence", which is exact. See
-    `Partitioned` for both. Use it if it is unknown which object will be difficult to track, and N/C
-    particles are sufficient to track all.
+    of the objects; None is the J circular shifts. `reassembly` is "prior", the paper's, in which
+    the weight of every set returns to 1/C (an approximation: the marginal likelihood is biased), or
+    "evidence", which is exact. See `Partitioned` for both. Use it if it is unknown which object
+    will be difficult to track, and N/C particles are sufficient to track all.
     """
-    orders = "circular" if orders is None else orders
+    orders = circular_orders(model.num_objects) if orders is None else orders
     partitioned = Partitioned(orders, reassembly=reassembly)
-    return Filter(
-        model,
-        moves=[Pool(), Resample(), RandomPartition(), partitioned],
-        num_particles=num_particles,
-        num_components=model.num_objects if isinstance(orders, str) else len(partitioned.orders),
-    )
+    moves = [Pool(), Resample(), RandomPartition(), partitioned]
+    return Filter(model, moves, num_particles, len(partitioned.orders))
 
 
 @checked

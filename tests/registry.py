@@ -171,7 +171,7 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         "partitioned in clusters": _joint(
             lambda joint: Filter(
                 joint,
-                [Resample(), KMeans(), Partitioned("circular")],
+                [Resample(), KMeans(), Partitioned([(c % 2, 1 - c % 2) for c in range(m)])],
                 NUM_PARTICLES,
                 m,
                 initial_moves=[KMeans(3, reseed=True)],
@@ -211,9 +211,9 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "guided mpf rqmc of families": lambda model: mpfjax.with_proposals_per_particle(
         _mpf(proposal=GaussNewtonProposal(), noise="rqmc")(model), 3
     ),
-    "ps adaptive, random order": _joint(
+    "ps adaptive, another order": _joint(
         lambda joint: mpfjax.map_moves(
-            mpfjax.partitioned_sampling(joint, NUM_PARTICLES, "random"),
+            mpfjax.partitioned_sampling(joint, NUM_PARTICLES, (1, 0)),
             lambda move: (
                 dataclasses.replace(move, scheme="multinomial", ess_threshold=0.5)
                 if isinstance(move, Resample)

@@ -118,18 +118,12 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
 
     def __getattr__(self, name: str) -> Any:
         # Only reached for names that the class lacks: the joint density is there if the objects'.
-        if name in ("log_transition", "sample_observation") and hasattr(self.object_model, name):
-            return getattr(self, f"_{name}")
+        if name == "log_transition" and hasattr(self.object_model, name):
+            return self._log_transition
         is_of_noise = name in ("transition_from_noise", "noise_dimension")
         if is_of_noise and is_made_of_noise(self.object_model):
             return getattr(self, f"_{name}")
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-
-    def _sample_observation(self, key: Key[Array, ""], states: PyTree) -> PyTree:
-        """The observation of every object, leaves (n, J, ...)."""
-        if self.shared_observation:
-            raise ValueError("shared_observation: it cannot be simulated for several objects")
-        return self._of_each("sample_observation", (0, 1), split(key, self.num_objects), states)
 
     def _of_each(self, method: str, axes: tuple[int, ...], *arguments: PyTree) -> PyTree:
         """What a method of each object's model gives, (n, J, ...), from its part of the arguments.

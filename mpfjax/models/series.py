@@ -229,12 +229,10 @@ def simulate(
     """Draw x_0, ..., x_t, leaves (t + 1, ...), and y_1, ..., y_t, leaves (t, ...), from a model.
 
     The model defines `sample_observation(key, states)`, y given each of n states; it raises
-    `ValueError` otherwise, and for objects with an interaction, which weighs states and draws none.
-    `inputs` are as for `run_filter`. Use it to test a filter on data whose states are known.
+    `ValueError` otherwise. `inputs` are as for `run_filter`. Use it to test a filter on data whose
+    states are known.
     """
     require(model, "sample_observation", "simulate")
-    if getattr(model, "interaction", None) is not None:
-        raise ValueError("interaction: a model with one gives weights, and cannot be simulated")
     inputs = steps_of_inputs(inputs, num_steps, model, "steps")
     return with_floats_traced(lambda model: _simulate(key, model, num_steps, inputs), model)
 

@@ -84,27 +84,15 @@ class Driven(Drift):
 
 
 @pytest.mark.exactness
-def test_series_of_one_particle_of_several_objects_and_with_inputs():
+def test_series_of_one_particle_and_with_inputs():
     states, observations = mpfjax.simulate(KEYS[0], mpfjax.per_particle(SeenOfOne()), 200)
     noise = np.asarray(observations - states[1:, 0])
     assert noise.shape == (200,)
     assert noise.std() == pytest.approx(0.7, abs=4 * 0.7 / np.sqrt(400))
-    joint = mpfjax.MultiObjectModel(mpfjax.QuadraticModel(0.3, 0.1, -2.0, 2.0), 3)
-    states, observations = mpfjax.simulate(KEYS[1], joint, 50)
-    assert (states.shape, observations.shape) == ((51, 3), (50, 3))
-    noise = np.asarray(observations - states[1:] ** 2)
-    assert noise.std() == pytest.approx(0.1, abs=4 * 0.1 / np.sqrt(300))
     states, _ = mpfjax.simulate(KEYS[2], Driven(), 4, inputs=jnp.arange(4.0))
     np.testing.assert_allclose(np.diff(states[:, 0]), np.arange(4.0), atol=1e-6)
     with pytest.raises(TypeError, match=r"model: Driven\.\w+.*its inputs None, as the call"):
         mpfjax.simulate(KEYS[2], Driven(), 4)
-
-
-def test_objects_that_interact_cannot_be_simulated():
-    repel = mpfjax.PairwiseRepulsion(1.0, 1.0)
-    joint = mpfjax.MultiObjectModel(mpfjax.QuadraticModel(), 2, repel)
-    with pytest.raises(ValueError, match=r"^interaction: .* cannot be simulated"):
-        mpfjax.simulate(KEYS[0], joint, 3)
 
 
 class Full(DriftOfOne):

@@ -146,7 +146,7 @@ INPUTS = {
 
 # One of each kind of filter that knows its own evidence, for the smoothers of a run.
 SMOOTHED_CHAINS = (
-    "pf", "pf adaptive", "guided pf", "mpf", "auxiliary mpf", "ps adaptive, random order", "dps",
+    "pf", "pf adaptive", "guided pf", "mpf", "auxiliary mpf", "ps adaptive, another order", "dps",
 )  # fmt: skip
 # The others run a filter of their own, and are compiled one by one.
 ONLINE_CHAINS = ("pf", "mpf", "dps")

@@ -1,6 +1,5 @@
 """Partitioned sampling: one object after the other, with weighted resampling in between."""
 
-import functools
 from typing import Any, Literal
 
 import equinox as eqx
@@ -38,9 +37,7 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
     and Ẑ is unbiased for every order. All resampling is within components.
 
     - `orders`: the order in which objects are propagated, counted from 0. One order for all
-      components; one order for each component; "circular", in which component c starts with object
-      c, then c + 1, and so on in a circle; or "random", a new order for each component at every
-      step. None is 0, ..., J-1.
+      components, or one for each component. None is 0, ..., J-1.
     - `resample`: the resampling after each object; by default systematic, at every object, with
       equal allocation. With its gradient "stop" the objects' draws are constants too, and
       derivatives pass through their densities, as in `Propagate`.
@@ -70,10 +67,14 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
         super().check(now, num_particles, num_components)
         check(MultiObjectModel, model=now.model)
         num_objects: int = now.model.num_objects  # pyright: ignore[reportAttributeAccessIssue]
-        if isinstance(self.orders, Array) and self.orders.shape[1] != num_objects:
+        if self.orders is None:
+            return
+        if self.orders.shape[1] != num_objects:
             what = f"no permutation of the objects 0 to {num_objects - 1}"
             raise ValueError(f"orders: {shown(self.orders)} is {what}")
-        self._orders(jax.random.key(0), num_objects, num_components)
+        if len(self.orders) not in (1, num_components):
+            each = f"{len(self.orders)} of them, for {num_components} components"
+            raise ValueError(f"orders: {each}")
 
     @property
     def approximate(self) -> bool:
@@ -92,8 +93,10 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
             return predict(key, model, mixture, gradient)
         num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
-        keys = split(key, 2 * num_objects + 1)
-        orders = self._orders(keys[-1], num_objects, mixture.num_components)
+        keys = split(key, 2 * num_objects)
+        orders = np.arange(num_objects)[None] if self.orders is None else self.orders
+        shape = (mixture.num_components, num_objects)
+        orders = jnp.broadcast_to(orders, shape).astype(jnp.int32)
         observation = model.prepare_observation(now.observation)
 
         def stage(carry: tuple, inputs: tuple) -> tuple[tuple, None]:
@@ -106,7 +109,7 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
             return (mixture, broken | fault), None
 
         ranks = jnp.arange(num_objects, dtype=jnp.int32)
-        inputs = (ranks, keys[:num_objects], keys[num_objects : 2 * num_objects])
+        inputs = (ranks, keys[:num_objects], keys[num_objects:])
         (moved, broken), _ = jax.lax.scan(stage, (mixture, jnp.zeros((), bool)), inputs)
         if self.reassembly == "prior" and mixture.num_components > 1:
             moved = _with_masses_of(mixture, moved)
@@ -161,33 +164,16 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
         moved = moved.replace(particles=model.replace_object(particles, objects, states))
         return moved, jnp.any(~(moved.log_weights < jnp.inf))
 
-    def _orders(
-        self, key: Key[Array, ""], num_objects: int, num_components: int
-    ) -> Int[Array, "m objects"]:
-        """The order of the objects in each component."""
-        if isinstance(self.orders, str):
-            if self.orders == "circular":
-                return jnp.asarray(circular_orders(num_components, num_objects))
-            keys = split(key, num_components)
-            draw = functools.partial(jax.random.permutation, x=num_objects)
-            return jax.vmap(draw)(keys).astype(jnp.int32)
-        orders = np.arange(num_objects)[None] if self.orders is None else self.orders
-        if orders.shape[0] not in (1, num_components):
-            raise ValueError(f"orders: {len(orders)} of them, for {num_components} components")
-        return jnp.broadcast_to(orders, (num_components, num_objects)).astype(jnp.int32)
 
-
-def circular_orders(num_orders: int, num_objects: int) -> Int[np.ndarray, "orders objects"]:
-    """The circular shifts c, c+1, ..., c-1 of 0, ..., J-1, for c = 0, 1, ...; after J, again."""
-    shifts = np.arange(num_orders)[:, None] + np.arange(num_objects)[None]
-    return (shifts % num_objects).astype(np.int32)
+def circular_orders(num_objects: int) -> Int[np.ndarray, "objects objects"]:
+    """The circular shifts c, c+1, ..., c-1 of 0, ..., J-1, for c = 0, ..., J-1."""
+    objects = np.arange(num_objects)
+    return (objects[:, None] + objects[None]) % num_objects
 
 
 def as_orders(orders: Any) -> Any:
-    """One order a row, or the name of a rule; a `ValueError` for one that is no permutation."""
-    if isinstance(orders, str) and orders not in ("circular", "random"):
-        raise ValueError(f"orders: {orders!r} is neither 'circular' nor 'random'")
-    if orders is None or isinstance(orders, str | AbstractStateSpaceModel):  # refused elsewhere
+    """One order a row; a `ValueError` for one that is no permutation."""
+    if orders is None or isinstance(orders, AbstractStateSpaceModel):  # refused elsewhere
         return orders
     if isinstance(orders, Tracer):
         return jnp.atleast_2d(orders).astype(jnp.int32)
