@@ -1,6 +1,5 @@
 """Clusters of objects against quadrature, and their merging by hand."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,37 +17,11 @@ OBSERVATIONS = jnp.array([[[0.2], [3.0], [-2.5]], [[1.0], [1.5], [-1.5]], [[1.2]
 REPULSION = PairwiseRepulsion(STRENGTH, RADIUS)
 
 
-def model_of(means):
-    objects = [walker(mean, noise) for mean, noise in zip(means, NOISES, strict=False)]
-    return MultiObjectModel(stack(objects), len(means), REPULSION)
-
-
-PAIR = model_of(MEANS)
+PAIR = MultiObjectModel(stack([*map(walker, MEANS, NOISES)]), 2, REPULSION)
 
 
 def labels_of(mixture):
     return mixture.memory["clusters"]["labels"]
-
-
-@eqx.filter_jit
-def estimates(keys, filter, observations):
-    """log Ẑ, the means at the end and the clusters' labels after each step, of a run a key."""
-
-    def run(key):
-
-        def collect(mixture):
-            return (mixture.mean()[:, 0], labels_of(mixture))
-
-        run = mpfjax.run_filter(key, filter, observations, collect)
-        means, labels = run.collected
-        return run.log_marginal_likelihood, means[-1], labels
-
-    return jax.vmap(run)(keys)
-
-
-def runs(filter, observations):
-    *found, labels = estimates(jax.random.split(jax.random.key(1), 600), filter, observations)
-    return *found, np.asarray(labels)
 
 
 @pytest.mark.weekly
@@ -56,8 +29,14 @@ def test_a_pair_that_repels_is_unbiased():
     """In some runs the pair meets at once, in others later."""
     filter, seen = mpfjax.clustered_particle_filter(PAIR, 20), OBSERVATIONS[:, :2]
     assert not filter.approximate
-    *found, labels = runs(filter, seen)
-    assert_both_unbiased(*found, *pair_on_a_grid(MEANS, seen, STRENGTH, RADIUS))
+
+    def collect(mixture):
+        return mixture.mean()[:, 0], labels_of(mixture)
+
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 600), filter, seen, collect)
+    means, labels = map(np.asarray, runs.collected)
+    exact = pair_on_a_grid(MEANS, seen, STRENGTH, RADIUS)
+    assert_both_unbiased(runs.log_marginal_likelihood, means[:, -1], *exact)
     is_merged = labels[:, :, 1] == 0
     assert 0.05 < is_merged[:, 0].mean() < 0.99
     assert (is_merged[:, 1:] >= is_merged[:, :-1]).all()

@@ -76,18 +76,10 @@ FILTERS = {
 @pytest.mark.exactness
 @pytest.mark.parametrize("name", ["dps", *weekly(["ps"])])
 def test_a_pair_that_repels_is_unbiased(name):
-    @eqx.filter_jit
-    @jax.vmap
-    def estimates(key):
-
-        def collect(mixture):
-            return mixture.mean()[:, 0]
-
-        run = mpfjax.run_filter(key, FILTERS[name](), OBSERVATIONS[:, :2], collect)
-        return run.log_marginal_likelihood, run.collected[-1]
-
-    exact = pair_on_a_grid(MEANS[:2], OBSERVATIONS[:, :2], STRENGTH, RADIUS)
-    assert_both_unbiased(*estimates(jax.random.split(jax.random.key(3), NUM_RUNS)), *exact)
+    keys, seen = jax.random.split(jax.random.key(3), NUM_RUNS), OBSERVATIONS[:, :2]
+    runs = mpfjax.monte_carlo(keys, FILTERS[name](), seen, lambda mixture: mixture.mean()[:, 0])
+    exact = pair_on_a_grid(MEANS[:2], seen, STRENGTH, RADIUS)
+    assert_both_unbiased(runs.log_marginal_likelihood, runs.collected[:, -1], *exact)
 
 
 @pytest.mark.exactness

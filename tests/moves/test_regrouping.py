@@ -22,7 +22,6 @@ from mpfjax import (
 )
 from mpfjax.moves.regrouping.features import summarise, summarise_about
 from tests.examples import make_mixture
-from tests.unbiased import assert_unbiased
 
 KEY = jax.random.key(0)
 RNG = np.random.default_rng(0)
@@ -264,8 +263,9 @@ class TestGroupBy:
         """Observations of x² say nothing of the sign; a plain filter of 20 loses one."""
         moves = [Resample(), Propagate(), GroupBy(label)]
         kept = Filter(MODEL, moves, 20, 2, initial_moves=[GroupBy(label)])
-        counts = mpfjax.run_filter(KEY, kept, jnp.full(100, 3.0), lambda m: m.component_counts)
-        assert int(counts.collected.min()) == 10
+        run = mpfjax.run_filter(KEY, kept, jnp.full(100, 3.0), lambda m: m.component_counts)
+        assert int(run.collected.min()) == 10
+        assert kept.step(KEY, run.final, 3.0)[1].labels_ran_out
 
 
 @pytest.mark.parametrize("masses", [(0.6, 0.1, 0.2, 0.0999, 1e-4, 1e-6), (1,)])
@@ -279,44 +279,6 @@ def test_only_what_is_below_the_share_of_the_heaviest_is_pruned(masses):
     np.testing.assert_array_equal(after.log_weights[kept], before.log_weights[kept])
     assert Prune().approximate
     assert Prune(1e-3)(KEY, before, mpfjax.Step(MODEL)) is before
-
-
-class FourAlike(mpfjax.AbstractStateSpaceModel):
-    """x_0 in one of four places, of which only the distance from the nearest is seen."""
-
-    def sample_initial(self, key, num_particles):
-        key_mode, key_place = jax.random.split(key)
-        modes = jax.random.choice(key_mode, jnp.asarray(MODES, jnp.float32), (num_particles,))
-        return modes + jax.random.normal(key_place, (num_particles,))
-
-    def sample_transition(self, key, states):
-        return states + 0.2 * jax.random.normal(key, states.shape)
-
-    def log_likelihood(self, observation, states):
-        return jax.scipy.stats.norm.logpdf(observation, jnp.mod(states, 20.0) - 10.0, 0.3)
-
-
-MODES = np.array([-30.0, -10.0, 10.0, 30.0])
-
-
-@pytest.mark.weekly
-def test_modes_that_share_a_label_keep_their_mass():
-    """E[Ẑ π_k] = Z / 4 for each of the four modes, with two labels, which run out."""
-    filter = mpfjax.mixture_particle_filter(FourAlike(), 200, 2)
-
-    def masses(mixture):
-        return [mixture.expectation(jnp.abs(mixture.particles - mode) < 10) for mode in MODES]
-
-    observations = jnp.array([0.5, -0.5, 0.3, 0.0])
-    runs = mpfjax.monte_carlo(jax.random.split(KEY, 600), filter, observations, masses)
-    log_z, found = np.asarray(runs.log_marginal_likelihood, float), np.stack(runs.collected, -1)
-    gaps = np.exp(log_z - log_z.max())[:, None] * (found[:, -1] - 0.25)
-    assert_unbiased(gaps, 0.0)
-    assert np.all(found[:, -1].mean(axis=0) > 0.15)
-    final = jax.tree.map(lambda leaf: leaf[0], runs.final)
-    for m, ran_out in ((2, True), (12, False)):
-        wider = filter.replace(num_components=m)
-        assert wider.step(KEY, final.replace(num_components=m), 0.0)[1].labels_ran_out == ran_out
 
 
 @pytest.mark.parametrize(("num_groups", "num_features"), [(3, 1), (12, 10)])
