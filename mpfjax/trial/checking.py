@@ -155,7 +155,7 @@ def _draw(key, model, now):
 
         drawn["origins of x_2"] = _log_densities(log_transition, _in_families(children), siblings)
     can_simulate = callable(getattr(model, "sample_observation", None))
-    if can_simulate and law.is_whole and getattr(model, "interaction", None) is None:
+    if can_simulate and law.is_whole:
         same = _repeat(_rows(after, slice(_PLACES)), _DRAWS)
         drawn["many y_1"] = _of_many_keys(_observe, keys[5], now, same)
         observations = _in_families(_observe(keys[5], now, _side_by_side(families)))
