@@ -131,7 +131,9 @@ class MarginalisedLaw(Law):
 
     def complete(self, draws: PyTree, states: PyTree) -> PyTree:
         """z_t with the moments of x_t predicted."""
-        return predict(self.model, draws, states)
+        law = predicted_gaussian(self.model, draws, states)
+        check_moved(draws, states.latent, self.model)
+        return _state_of(draws, law, states.mean.shape[0])
 
     def start(self, draws: PyTree) -> PyTree:
         """z_0 with the moments of x_0."""
@@ -143,12 +145,16 @@ class MarginalisedLaw(Law):
 
     def see(self, observation: PyTree, states: PyTree) -> tuple[PyTree, list[Float[Array, " n"]]]:
         """The moments given y_t too, and the factors of z and of x."""
+        model, n = self.model, states.mean.shape[0]
         log_factors = [self.log_likelihood_of_draws(observation, states.latent)]
-        states, log_density = update(self.model, observation, states)
-        if log_density is not None:
-            number = states.mean.shape[0]
-            log_factors.append(real_each(log_density, number, self.model, "emission"))
-        return states, log_factors
+        emission = emission_of(model, states.latent, states)
+        if emission is None:
+            return states, log_factors
+        rows = observation_rows(model, observation, emission, states.mean.dtype)
+        law, log_density = gaussians.update(filtered_gaussian(model, states), rows, emission)
+        log_density = jnp.broadcast_to(log_density, (n,))
+        log_factors.append(real_each(log_density, n, model, "emission"))
+        return _state_of(states.latent, law, n), log_factors
 
 
 class MixedLaw(MarginalisedLaw):
@@ -199,13 +205,6 @@ def _initial_moments(model: Any, latent: PyTree) -> list[Array]:
     return _checked(model, "initial_moments", model.initial_moments(latent), n, m0="d", P0="d d")
 
 
-def predict(model: Any, latent: PyTree, state: MarginalisedState) -> MarginalisedState:
-    """The moments of x_t given z_t and y_1..y_{t-1}, from those of x_{t-1}."""
-    law = predicted_gaussian(model, latent, state)
-    check_moved(latent, state.latent, model)
-    return _state_of(latent, law, state.mean.shape[0])
-
-
 def _state_of(latent: PyTree, law: Gaussian, n: int) -> MarginalisedState:
     """The law of each particle with the particles first."""
     return MarginalisedState(latent, *(particles_first(values, n) for values in law))
@@ -236,18 +235,6 @@ def decorrelate(
         dynamics.offset + apply(slope, latent - mixed.offset),
         dynamics.noise - product(transpose(half), half),
     )
-
-
-def update(
-    model: Any, observation: PyTree, state: MarginalisedState
-) -> tuple[MarginalisedState, Float[Array, " n"] | None]:
-    """The moments of x_t given y_t too, and log p(y_t | z, y_1..y_{t-1}); None if unobserved."""
-    emission = emission_of(model, state.latent, state)
-    if emission is None:
-        return state, None
-    n, rows = state.mean.shape[0], observation_rows(model, observation, emission, state.mean.dtype)
-    law, log_density = gaussians.update(filtered_gaussian(model, state), rows, emission)
-    return _state_of(state.latent, law, n), jnp.broadcast_to(log_density, (n,))
 
 
 def latent_rows(model: Any, latent: Any) -> Float[Array, "k n"]:

@@ -19,14 +19,8 @@ from mpfjax.robots.maps import OccupancyGrid, Poses
 from mpfjax.robots.motion import wrap
 from mpfjax.robots.sensors import POSE
 
-_MOTION = Rule(
-    lambda motion: hasattr(motion, "from_noise") and hasattr(motion, "noise_dimension"),
-    "a motion with from_noise and noise_dimension, as OdometryMotion()",
-)
-_SENSOR = Rule(
-    lambda sensor: callable(getattr(sensor, "log_likelihood", None)),
-    "a sensor with log_likelihood(scan, poses, grid), as LikelihoodField(...)",
-)
+_MOTION = Rule(lambda motion: hasattr(motion, "from_noise"), "a motion, as OdometryMotion()")
+_SENSOR = Rule(lambda sensor: hasattr(sensor, "log_likelihood"), "a sensor, as LikelihoodField()")
 
 
 class RobotModel(AbstractStateSpaceModel, Fitting):

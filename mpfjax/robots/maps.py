@@ -100,30 +100,38 @@ class OccupancyGrid(Fitting):
         # and a part of a cell for what is rounded.
         margin = np.sqrt(2) + 0.01
         headings = poses[:, 2:] + angles[None]
-        way = jnp.stack([jnp.cos(headings), jnp.sin(headings)])
-        places = (poses[:, :2] - jnp.array([self.origin], poses.dtype)) / self.resolution
-        start = jnp.broadcast_to(places.T[:, :, None], way.shape)
-        # Of x and y each, where the next border is, and how far along the ray it is to another.
-        ahead = jnp.where(way > 0, 1.0, 0.0)
-        between = jnp.where(way == 0, jnp.inf, 1 / jnp.where(way == 0, 1.0, jnp.abs(way)))
+        axes = []
+        for k, way in ((0, jnp.cos(headings)), (1, jnp.sin(headings))):
+            start = jnp.broadcast_to(
+                (poses[:, k, None] - self.origin[k]) / self.resolution, way.shape
+            )
+            # To the first border, and between borders, along the ray.
+            between = jnp.where(way == 0, jnp.inf, 1 / jnp.where(way == 0, 1.0, jnp.abs(way)))
+            axes.append((start, way, between, jnp.where(way > 0, 1.0, 0.0)))
+
+        def border(axis: tuple[Array, ...], cell: Array) -> Array:
+            start, way, between, ahead = axis
+            gap = (cell + ahead - start) * jnp.where(way > 0, 1.0, -1.0)
+            return jnp.where(way == 0, jnp.inf, gap * between)
 
         def advance(carry: tuple[Array, ...]) -> tuple[Array, ...]:
-            reach, cell, going = carry
-            columns, rows = cell.astype(jnp.int32)
-            rows, columns, inside = self._clip(rows, columns)
+            reach, x, y, going = carry
+            rows, columns, inside = self._clip(y.astype(jnp.int32), x.astype(jnp.int32))
             gaps = jnp.where(inside, safe[rows, columns], jnp.inf)
-            borders = (cell + ahead - start) * (2 * ahead - 1) * between
-            borders = jnp.where(way == 0, jnp.inf, borders)
-            nearest = jnp.maximum(jnp.min(borders, axis=0), reach)
+            of_x, of_y = border(axes[0], x), border(axes[1], y)
+            nearest = jnp.maximum(jnp.minimum(of_x, of_y), reach)
             far = jnp.minimum(reach + gaps - margin, limit)
             leaps, going = far > nearest, going & (gaps >= 0) & (reach < limit)
-            is_next = jnp.stack([borders[0] <= borders[1], borders[1] < borders[0]])
-            stepped = cell + jnp.where(is_next, 2 * ahead - 1, 0.0)
-            landed = jnp.where(leaps[None], jnp.floor(start + far[None] * way), stepped)
-            reach = jnp.where(going, jnp.where(leaps, far, nearest), reach)
-            return reach, jnp.where(going[None], landed, cell), going
+            moved = []
+            for axis, cell, is_next in ((axes[0], x, of_x <= of_y), (axes[1], y, of_y < of_x)):
+                start, way, _, ahead = axis
+                stepped = cell + jnp.where(is_next, 2 * ahead - 1, 0.0)
+                landed = jnp.where(leaps, jnp.floor(start + far * way), stepped)
+                moved.append(jnp.where(going, landed, cell))
+            return jnp.where(going, jnp.where(leaps, far, nearest), reach), *moved, going
 
-        carry = jnp.zeros_like(headings), jnp.floor(start), jnp.ones(headings.shape, bool)
+        first = [jnp.floor(start) for start, *_ in axes]
+        carry = jnp.zeros_like(headings), *first, jnp.ones(headings.shape, bool)
         reach = jax.lax.while_loop(lambda carry: jnp.any(carry[-1]), advance, carry)[0]
         return self.resolution * jnp.minimum(reach, limit)
 

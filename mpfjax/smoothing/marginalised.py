@@ -82,8 +82,8 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
 
     def forth(state: MarginalisedState, step: Any) -> tuple[Any, Any]:
         latent, observation, now = step
-        model_now = with_inputs(model, now)
-        state, _ = linear.update(model_now, observation, linear.predict(model_now, latent, state))
+        law = law_of(with_inputs(model, now))
+        state, _ = law.see(observation, law.complete(latent, state))
         return state, state
 
     nothing = _nothing(end.mean)
