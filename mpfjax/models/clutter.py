@@ -115,9 +115,7 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
 
     def detection(self, states: PyTree) -> Float[Array, " n"]:
         """p_D of each state."""
-        p = self.detection_probability
-        p = over_particles(self.object_model, p)(states) if callable(p) else p
-        return jnp.broadcast_to(p, jax.tree.leaves(states)[0].shape[:1]).astype(default_float())
+        return number_of_each(self.object_model, self.detection_probability, states)
 
     def __getattr__(self, name: str) -> Any:
         # Only reached for names that the class lacks.
@@ -126,6 +124,12 @@ class ClutteredModel(AbstractStateSpaceModel, Fitting):
         if name in PASSED_ON and (not is_of_noise or is_made_of_noise(model, state)):
             return getattr(model, name)
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+
+def number_of_each(model: Any, number: Any, states: PyTree) -> Float[Array, " n"]:
+    """A number of each state of the model, or the function of the states, in its own terms."""
+    values = over_particles(model, number)(states) if callable(number) else number
+    return jnp.broadcast_to(values, jax.tree.leaves(states)[0].shape[:1]).astype(default_float())
 
 
 def measurement_mask(observation: PyTree) -> Bool[Array, " k"]:

@@ -72,10 +72,7 @@ class Law:
 
     def log_initial(self, states: PyTree) -> Float[Array, " n"]:
         """log p(x_0) of each particle."""
-        with asking(self.model, "log_initial"):
-            values = self.model.log_initial(states)
-        number = jax.tree.leaves(states)[0].shape[0]
-        return real_each(values, number, self.model, "log_initial")
+        return self._log_density("log_initial", states)
 
     def move(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """x_t of each particle, from x_{t-1}."""
@@ -103,10 +100,12 @@ class Law:
 
     def log_transition(self, draws: PyTree, states: PyTree) -> Float[Array, " n"]:
         """log D of the random part of x_t, given x_{t-1}."""
-        with asking(self.model, "log_transition"):
-            values = self.model.log_transition(draws, self.part(states))
-        number = jax.tree.leaves(draws)[0].shape[0]
-        return real_each(values, number, self.model, "log_transition")
+        return self._log_density("log_transition", draws, self.part(states))
+
+    def _log_density(self, method: str, draws: PyTree, *given: PyTree) -> Float[Array, " n"]:
+        with asking(self.model, method):
+            values = getattr(self.model, method)(draws, *given)
+        return real_each(values, jax.tree.leaves(draws)[0].shape[0], self.model, method)
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """log L(y_t | x_t) of each particle; with x integrated out where it has moments."""

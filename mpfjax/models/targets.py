@@ -15,9 +15,8 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.arrays import FINITE, NOT_NEGATIVE, POSITIVE, Fitting, check_spacing, to_array
 from mpfjax.checks import SHARES, is_series
-from mpfjax.models.base import AbstractStateSpaceModel, over_particles
-from mpfjax.models.clutter import PASSED_ON, ClutteredModel, number_or_function
-from mpfjax.operations.logarithms import default_float
+from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.clutter import PASSED_ON, ClutteredModel, number_of_each, number_or_function
 from mpfjax.operations.matrices import total
 from mpfjax.operations.random import normal, split, uniform
 
@@ -198,11 +197,9 @@ class TargetsModel(AbstractStateSpaceModel, Fitting):
         scans = zip(self.sensors, self.scans(observation), strict=True)
         return total([sensor.log_likelihood(scan, states) for sensor, scan in scans])
 
-    def survival(self, states: PyTree) -> Float[Array, " #n"]:
+    def survival(self, states: PyTree) -> Float[Array, " n"]:
         """p_S of each state."""
-        p = self.survival_probability
-        p = over_particles(self.sensors[0].object_model, p)(states) if callable(p) else p[None]
-        return p.astype(default_float())
+        return number_of_each(self.sensors[0].object_model, self.survival_probability, states)
 
     def __getattr__(self, name: str) -> Any:
         # Only reached for names that the class lacks.

@@ -121,9 +121,11 @@ def test_odometry_is_table_5_6(step):
         assert abs(after[2]) <= np.pi
 
 
+FIELD, MOTION = robots.LikelihoodField(ANGLES, laser_max_range=MOST), robots.OdometryMotion()
+
+
 def robot(**options):
-    sensor = robots.LikelihoodField(ANGLES, laser_max_range=MOST)
-    return robots.RobotModel(GRID, robots.OdometryMotion(), sensor, **options)
+    return robots.RobotModel(GRID, MOTION, FIELD, **options)
 
 
 @pytest.mark.exactness
@@ -252,19 +254,6 @@ def test_a_robot_is_in_no_wall_and_may_be_where_the_map_is_unknown():
 
 
 @pytest.mark.parametrize(
-    ("pose", "what"),
-    [((9.0, 3.0, 0.0), "off the map"), ((1.2, 3.0, 0.0), "in an occupied cell"),
-     ((0.5, 2.55, 90.0), "radians"), ((0.5, 2.55, np.nan), "finite")],
-)  # fmt: skip
-def test_an_initial_pose_that_cannot_be_is_refused(pose, what):
-    with pytest.raises(ValueError, match=f"initial_pose: .*{what}"):
-        robot(initial_pose=pose)
-
-
-FIELD, MOTION = robots.LikelihoodField(ANGLES, laser_max_range=MOST), robots.OdometryMotion()
-
-
-@pytest.mark.parametrize(
     ("named", "make"),
     [
         ("angles: .*radians", lambda: robots.LikelihoodField(
@@ -276,6 +265,10 @@ FIELD, MOTION = robots.LikelihoodField(ANGLES, laser_max_range=MOST), robots.Odo
         ("sensor: ", lambda: robots.RobotModel(GRID, MOTION, MOTION)),
         ("occupied: ", lambda: robots.OccupancyGrid(np.zeros((2, 2), bool), resolution=CELL)),
         ("clearance: ", lambda: robot(clearance=9.0)),
+        ("initial_pose: .*off the map", lambda: robot(initial_pose=(9.0, 3.0, 0.0))),
+        ("initial_pose: .*occupied cell", lambda: robot(initial_pose=(1.2, 3.0, 0.0))),
+        ("initial_pose: .*radians", lambda: robot(initial_pose=(0.5, 2.55, 90.0))),
+        ("initial_pose: .*finite", lambda: robot(initial_pose=(0.5, 2.55, np.nan))),
         ("observation: ", lambda: robot().log_likelihood(SCAN[1:], POSES)),
         ("inputs: None", lambda: robot().sample_transition(jax.random.key(0), POSES)),
     ],
