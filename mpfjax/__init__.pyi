@@ -58,7 +58,6 @@ from mpfjax.moves.initial import SelectInitial as SelectInitial
 from mpfjax.moves.metropolis import AbstractMetropolis as AbstractMetropolis
 from mpfjax.moves.metropolis import RandomWalkMetropolis as RandomWalkMetropolis
 from mpfjax.moves.objects.bernoulli import Associate as Associate
-from mpfjax.moves.objects.exclusion import Exclusion as Exclusion
 from mpfjax.moves.objects.partitioned import Partitioned as Partitioned
 from mpfjax.moves.objects.tracks import TargetEstimates as TargetEstimates
 from mpfjax.moves.objects.tracks import estimate_targets as estimate_targets
@@ -72,6 +71,7 @@ from mpfjax.moves.propagation.proposals import NetworkProposal as NetworkProposa
 from mpfjax.moves.propagation.regimes import PropagateRegimes as PropagateRegimes
 from mpfjax.moves.propagation.regimes import RegimeProposal as RegimeProposal
 from mpfjax.moves.regrouping.kmeans import KMeans as KMeans
+from mpfjax.moves.regrouping.merge import Exclusion as Exclusion
 from mpfjax.moves.regrouping.merge import Merge as Merge
 from mpfjax.moves.regrouping.merge import Prune as Prune
 from mpfjax.moves.regrouping.partitions import GroupBy as GroupBy

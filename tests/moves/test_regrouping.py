@@ -8,6 +8,7 @@ import pytest
 
 import mpfjax
 from mpfjax import (
+    Exclusion,
     Filter,
     GroupBy,
     KMeans,
@@ -279,6 +280,22 @@ def test_only_what_is_below_the_share_of_the_heaviest_is_pruned(masses):
     np.testing.assert_array_equal(after.log_weights[kept], before.log_weights[kept])
     assert Prune().approximate
     assert Prune(1e-3)(KEY, before, mpfjax.Step(MODEL)) is before
+
+
+def test_each_particle_is_weighed_down_by_the_other_components_means():
+    states = np.array([[0.0], [1.0], [1.5], [9.0], [7.0]])
+    log_weights = np.array([0.0, 1.0, 0.5, 0.0, -np.inf])
+    mixture = make_mixture(states, log_weights, [0, 0, 1, 2, 2], 4)
+    move = eqx.filter_jit(Exclusion(strength=3.0, radius=0.5, scale=2.0))
+    moved = move(KEY, mixture, mpfjax.Step(MODEL, jnp.float32(0.0)))
+    means = np.array([0.5, 1.5, 9.0]) / 2
+    bumps = np.exp(-((states / 2 - means[None]) ** 2) / (2 * 0.5**2))
+    own = np.array([0, 0, 1, 2])
+    expected = [bumps[i].sum() - bumps[i, own[i]] for i in range(4)]
+    lowered = np.asarray(mixture.log_weights - moved.log_weights)[:4]
+    np.testing.assert_allclose(lowered, 3.0 * np.array(expected), rtol=1e-5, atol=1e-6)
+    assert moved.log_weights[4] == -np.inf
+    np.testing.assert_array_equal(moved.particles, mixture.particles)
 
 
 @pytest.mark.parametrize(("num_groups", "num_features"), [(3, 1), (12, 10)])

@@ -34,9 +34,9 @@ from mpfjax import (
 )
 from mpfjax.moves.initial import SelectInitial
 from mpfjax.moves.objects.clusters import PropagateInClusters
-from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.propagation.propagate import Predict, Reweight
+from mpfjax.moves.regrouping.merge import Exclusion
 from mpfjax.running.islands import IslandInteraction
 from mpfjax.smoothing.variance import batch_estimate, log_marginal_likelihood_variance
 from tests.marking import weekly

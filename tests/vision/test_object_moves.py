@@ -7,8 +7,7 @@ import numpy as np
 
 from mpfjax import QuadraticModel, Step
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.objects.exclusion import Exclusion
-from mpfjax.moves.regrouping.merge import Prune
+from mpfjax.moves.regrouping.merge import Exclusion, Prune
 from mpfjax.vision.boxes.colour_model import BoxState
 
 NOW = Step(QuadraticModel(), np.float32(0.0))

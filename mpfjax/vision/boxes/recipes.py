@@ -15,10 +15,9 @@ from jaxtyping import Array, Float, UInt8
 from mpfjax.filter import Filter
 from mpfjax.filters import mixture_particle_filter, particle_filter
 from mpfjax.models.dynamics import RandomWalkWithJumps, WalkWithVelocity
-from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.regrouping.kmeans import KMeans
-from mpfjax.moves.regrouping.merge import Merge, Prune
+from mpfjax.moves.regrouping.merge import Exclusion, Merge, Prune
 from mpfjax.moves.regrouping.partitions import GroupBy
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.resample import Resample
