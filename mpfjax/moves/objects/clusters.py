@@ -214,7 +214,7 @@ def coupled(
         return jnp.zeros((num_objects, num_objects), bool)
     first, second = np.triu_indices(num_objects, 1)
 
-    def touch(carry: None, pair: tuple) -> tuple[None, Bool[Array, ""]]:
+    def touch(pair: tuple) -> Bool[Array, ""]:
         i, j = pair
 
         def look() -> Bool[Array, ""]:
@@ -222,11 +222,10 @@ def coupled(
             log_psi = over_pairs(*(model.object_states(points, k) for k in pair))
             return jnp.any(log_psi != 0)
 
-        return carry, jax.lax.cond(labels[i] == labels[j], lambda: jnp.zeros((), bool), look)
+        return jax.lax.cond(labels[i] == labels[j], lambda: jnp.zeros((), bool), look)
 
     pairs = (jnp.asarray(first, jnp.int32), jnp.asarray(second, jnp.int32))
-    _, touches = jax.lax.scan(touch, None, pairs)
-    half = jnp.zeros((num_objects, num_objects), bool).at[pairs].set(touches)
+    half = jnp.zeros((num_objects, num_objects), bool).at[pairs].set(jax.lax.map(touch, pairs))
     return half | half.T
 
 
@@ -253,7 +252,7 @@ def scores(
     An object alone needs neither: the score of its row is the likelihood of its own point.
     """
 
-    def score(carry: None, j: Int[Array, ""]) -> tuple[None, tuple]:
+    def score(j: Int[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         def shared() -> tuple[Float[Array, " n"], Float[Array, " n"]]:
             log_f = jax.vmap(partial(_log_kernels, model, j), in_axes=(0, None))
             table = log_f(model.object_states(particles, j), model.object_states(points, j))
@@ -264,10 +263,9 @@ def scores(
         def single() -> tuple[Float[Array, " n"], Float[Array, " n"]]:
             return jnp.zeros_like(log_likelihoods[j]), log_likelihoods[j]
 
-        return carry, jax.lax.cond(alone[j], single, shared)
+        return jax.lax.cond(alone[j], single, shared)
 
-    objects = jnp.arange(len(alone), dtype=jnp.int32)
-    return jax.lax.scan(score, None, objects)[1]
+    return jax.lax.map(score, jnp.arange(len(alone), dtype=jnp.int32))
 
 
 def recombine(
