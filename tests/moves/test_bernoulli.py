@@ -270,48 +270,30 @@ def gaussian_sums(number, rate, survival, first, second):
 
 @pytest.mark.exactness
 @pytest.mark.parametrize("proposal", [None, *weekly([Wide()])])
-def test_objects_not_detected_yet_are_those_of_gaussian_sums(proposal):
-    """Two scans from a Poisson number of objects, in whose second no two compete."""
-    number, rate, survival = 2.0, 0.5, 0.95
-    first, second = np.array([-2.5, 2.0]), 2.2
-    old, new, undetected, log_evidence = gaussian_sums(number, rate, survival, first, [second])
+@pytest.mark.parametrize(
+    ("number", "first", "second"),
+    [(2.0, [-2.5, 2.0], [2.2]), (0.0, [0.0, 0.7], [0.1, 0.6]), (0.0, [0.0, 0.7], [0.4])],
+)
+def test_two_scans_are_those_of_gaussian_sums(number, first, second, proposal):
+    """From a Poisson number of objects; and of two that began in one scan, which are not one."""
+    old, new, undetected, log_evidence = gaussian_sums(number, 0.5, 0.95, first, second)
     options = {"particles_per_birth": 500, "undetected_particles": 1000}
     move = Associate(resample=mpfjax.Resample(), **options)
-    targets = model(rate, survival_probability=survival, initial_number=number)
-    filter = Filter(targets, [Predict(proposal), move], 3000, 7)
-    scans = jnp.asarray([[[-2.5], [2.0]], [[second], [NAN]]], jnp.float32)
+    filter = Filter(model(initial_number=number), [Predict(proposal), move], 3000, 7)
+    scans = jnp.asarray([first, [*second, *[NAN] * (2 - len(second))]], jnp.float32)[..., None]
     runs = mpfjax.monte_carlo(
         jax.random.split(KEY, 20), filter, scans, collect=mpfjax.estimate_targets
     )
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[:, -1], runs.collected)
-    found = np.stack([np.where(last.labels == k, last.existence, 0).sum(1) for k in (1, 2, 3)], 1)
-    # Labels of the first scan are dealt by the most probable.
-    np.testing.assert_allclose(np.sort(found[:, :2].mean(0)), np.sort(old), atol=0.02)
-    np.testing.assert_allclose(found[:, 2].mean(), new, atol=0.02)
-    np.testing.assert_allclose(last.undetected.mean(), undetected, atol=0.05)
     exact_number = old.sum() + new.sum() + undetected
-    np.testing.assert_allclose(last.expected_number.mean(), exact_number, atol=0.03)
+    np.testing.assert_allclose(last.expected_number.mean(), exact_number, atol=0.04)
+    np.testing.assert_allclose(last.undetected.mean(), undetected, atol=0.05)
     log_z = np.asarray(runs.log_marginal_likelihood)
-    np.testing.assert_allclose(log_z.mean(), log_evidence, atol=0.03)
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize("second", [[0.1, 0.6], [0.4]])
-def test_components_that_began_in_one_scan_are_not_one_object(second):
-    """Each has a measurement of its own there, until the next scan tells them apart."""
-    first = np.array([0.0, 0.7])
-    old, new, undetected, log_evidence = gaussian_sums(0.0, 0.5, 0.95, first, second)
-    filter = mpfjax.bernoulli_filter(
-        model(), 2000, 6, particles_per_birth=500, resample=mpfjax.Resample()
-    )
-    scans = jnp.asarray([first, [*second, *[NAN] * (2 - len(second))]], jnp.float32)[..., None]
-    runs = mpfjax.monte_carlo(
-        jax.random.split(KEY, 8), filter, scans, collect=mpfjax.estimate_targets
-    )
-    found = np.asarray(runs.collected.expected_number)[:, -1].mean()
-    np.testing.assert_allclose(found, old.sum() + new.sum() + undetected, atol=0.05)
-    log_z = np.asarray(runs.log_marginal_likelihood)
-    np.testing.assert_allclose(log_z.mean(), log_evidence, atol=0.05)
+    np.testing.assert_allclose(log_z.mean(), log_evidence, atol=0.04)
+    if number > 0:  # no two compete; labels of the first scan are dealt by the most probable
+        each = [np.where(last.labels == k, last.existence, 0).sum(1).mean() for k in (1, 2, 3)]
+        np.testing.assert_allclose(np.sort(each[:2]), np.sort(old), atol=0.02)
+        np.testing.assert_allclose(each[2], new, atol=0.02)
 
 
 @pytest.mark.exactness
