@@ -286,15 +286,3 @@ def test_poses_in_place_of_steps_are_a_warning(recwarn):
     assert not any("odometry_steps" in str(each.message) for each in recwarn)
     with pytest.warns(RuntimeWarning, match="inputs: they look like poses"):
         mpfjax.run_filter(jax.random.key(0), filter, scans, inputs=poses[1:])
-
-
-@pytest.mark.exactness
-@pytest.mark.real_data
-def test_public_map(data):
-    """TurtleBot3's world, most of which is unknown."""
-    path = data / "maps" / "turtlebot3_world.pgm"
-    if not path.is_file():
-        pytest.skip(f"no {path}: a folder of sequences need not have the public map")
-    grid = robots.read_map(path, resolution=0.05)
-    assert grid.occupied.shape == (384, 384)
-    assert 0 < grid.occupied.sum() < grid.free.sum() < (~grid.free & ~grid.occupied).sum()
