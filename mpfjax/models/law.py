@@ -102,9 +102,9 @@ class Law:
         """log D of the random part of x_t, given x_{t-1}."""
         return self._log_density("log_transition", draws, self.part(states))
 
-    def _log_density(self, method: str, draws: PyTree, *given: PyTree) -> Float[Array, " n"]:
+    def _log_density(self, method: str, draws: PyTree, *previous: PyTree) -> Float[Array, " n"]:
         with asking(self.model, method):
-            values = getattr(self.model, method)(draws, *given)
+            values = getattr(self.model, method)(draws, *previous)
         return real_each(values, jax.tree.leaves(draws)[0].shape[0], self.model, method)
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
