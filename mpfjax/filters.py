@@ -229,8 +229,8 @@ def distributed_partitioned_sampling(
     "evidence", which is exact. See `Partitioned` for both. Use it if it is unknown which object
     will be difficult to track, and N/C particles are sufficient to track all.
     """
-    orders = circular_orders(model.num_objects) if orders is None else orders
-    partitioned = Partitioned(orders, reassembly=reassembly)
+    rows = circular_orders(model.num_objects) if orders is None else orders
+    partitioned = Partitioned(rows, reassembly=reassembly)
     moves = [Pool(), Resample(), RandomPartition(), partitioned]
     return Filter(model, moves, num_particles, len(partitioned.orders))
 
