@@ -34,7 +34,6 @@ from mpfjax import (
 from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.propagation.propagate import Predict, Reweight
-from mpfjax.moves.regrouping.merge import Exclusion
 from mpfjax.moves.resampling.gaussian import RegenerateObjects
 
 NUM_PARTICLES = 48
