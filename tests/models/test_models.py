@@ -68,11 +68,6 @@ def test_simulated_series_have_the_moments_of_the_joint_gaussian():
     assert np.abs(z).max() < 4
 
 
-class SeenOfOne(DriftOfOne):
-    def sample_observation(self, key, state):
-        return state[0] + 0.7 * jax.random.normal(key)
-
-
 class Driven(Drift):
     inputs: jax.Array | None = None
 
@@ -85,7 +80,7 @@ class Driven(Drift):
 
 @pytest.mark.exactness
 def test_series_of_one_particle_and_with_inputs():
-    states, observations = mpfjax.simulate(KEYS[0], mpfjax.per_particle(SeenOfOne()), 200)
+    states, observations = mpfjax.simulate(KEYS[0], mpfjax.per_particle(Full()), 200)
     noise = np.asarray(observations - states[1:, 0])
     assert noise.shape == (200,)
     assert noise.std() == pytest.approx(0.7, abs=4 * 0.7 / np.sqrt(400))
@@ -97,6 +92,9 @@ def test_series_of_one_particle_and_with_inputs():
 
 class Full(DriftOfOne):
     """With all that the library looks for."""
+
+    def sample_observation(self, key, state):
+        return state[0] + 0.7 * jax.random.normal(key)
 
     def log_initial(self, state):
         return -0.5 * (state**2).sum()

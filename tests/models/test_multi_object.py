@@ -123,29 +123,13 @@ class TestWhetherParametersAreEachObjectsOwn:
         # Two dimensions and two objects: every array has a leading axis of two.
         square = mpfjax.LinearGaussianModel(*[jnp.eye(2)] * 4, jnp.zeros(2), jnp.eye(2))
         assert not MultiObjectModel(square, 2).per_object
+        assert MultiObjectModel(square, 2, per_object=True).per_object  # if it is said
         assert MultiObjectModel(stack([square, square]), 2).per_object
         assert not MultiObjectModel(Drift(), 3).per_object
         assert MultiObjectModel(stack([OBJECTS[0]]), 1).per_object
         deviations = jnp.array([0.1, 0.2, 0.3])
         scalars = eqx.filter_vmap(mpfjax.QuadraticModel)(deviations, deviations)
         assert MultiObjectModel(scalars, 3).per_object
-
-    def test_is_said_where_both_would_work(self):
-        class Walk(Batched):
-            deviations: jax.Array
-
-            def sample_initial(self, key, num_particles):
-                return jax.random.normal(key, (num_particles, 2))
-
-            def sample_transition(self, key, states):
-                return states + self.deviations * jax.random.normal(key, states.shape)
-
-        ambiguous = Walk(jnp.array([0.1, 0.2]))
-        with jax.numpy_rank_promotion("allow"):
-            assert not MultiObjectModel(ambiguous, 2).per_object
-            for per_object in (True, False):
-                model = MultiObjectModel(ambiguous, 2, per_object=per_object)
-                assert model.per_object == per_object
 
     def test_another_number_of_objects_is_refused(self):
         with pytest.raises(ValueError, match="object_model: not every array"):
