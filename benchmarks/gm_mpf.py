@@ -31,7 +31,7 @@ from benchmarks.harness import AtLeast2, Count, Natural, Seed, command
 from benchmarks.scenes import boxes_over_time, football_scene
 from mpfjax.vision import read_truth
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
-from mpfjax.vision.colour.bins import HSVColours
+from mpfjax.vision.colour import HSVColours
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
 
@@ -143,7 +143,7 @@ def open_targets(
     data = Path(os.environ.get("MPFJAX_DATA", "../shared/data")) / "pets09_s2l1"
     if sequence is None and data.is_dir():
         sequence, ids, span = data, ids or (11, 13), span or "129:199"
-    first, last = frames.parse_range(span, "--frames")
+    first, last = frames.parse_range(span)
     if sequence is None:
         scene = football_scene(jax.random.key(seed), last or 80, num_players=2, still_camera=True)
         name, rows, stills = "rendered scene", scene.tracks, scene.frames[first - 1 :]

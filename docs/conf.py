@@ -28,7 +28,7 @@ nitpick_ignore_regex = [
     ("py:class", r"mpfjax\.tuning\.(chains|problem|densities)\.\w+"),
     ("py:class", r"mpfjax\.(moves\.conditional|running\.(late|long_runs))\.\w+"),
     ("py:class", r"mpfjax\.moves\.resampling\.(line|ancestors)\.\w+"),
-    ("py:class", r"mpfjax\.vision\.colour\.(bins|histograms)\.\w+"),
+    ("py:class", r"mpfjax\.vision\.colour\.\w+"),
     ("py:class", r"mpfjax\.vision\.tracking\.(camera|clutter|gaussian|lives)\.\w+"),
     ("py:class", r"mpfjax\.vision\.tracking\.(kinds|noise|scores|vectors)\.\w+"),
     ("py:class", r"mpfjax\.(mixture\.Within|models\.law\.Law)"),

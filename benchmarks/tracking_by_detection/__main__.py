@@ -103,7 +103,7 @@ def main(
     """
     if bool(folders) == (scene is not None):
         raise ValueError("one of DIR and --scene is needed, and not both")
-    span = files.parse_range(frames, "--frames")
+    span = files.parse_range(frames)
     if scene is None:
         found = [each for folder in folders for each in opened(folder, *span)]
     else:

@@ -74,7 +74,7 @@ def main(
     """
     if sum(map(bool, (box, ids, detect))) > 1 or (sequence and video):
         raise ValueError("one of --sequence and --video, and of --box, --ids and --detect")
-    span = parse_range(frames, "--frames")
+    span = parse_range(frames)
     if video is not None:
         check_outputs(out, ["tracking.mp4"], {"--video": video})
     source = open_source(sequence, video, span, seed, box, ids, detect)

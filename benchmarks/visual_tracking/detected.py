@@ -14,8 +14,8 @@ import mpfjax
 from benchmarks.visual_tracking.following import Snapshot
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractPropagation
-from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
-from mpfjax.vision.tracking.detections import FrameDetections
+from mpfjax.vision import BackgroundSubtraction, ObjectTracker, Tracks
+from mpfjax.vision.tracking.detections import BOXES, FrameDetections
 from mpfjax.vision.tracking.gaussian import Gaussian, places_of, units
 from mpfjax.vision.tracking.step import WEAK_ERROR, advance
 from mpfjax.vision.tracking.track import offline_rows
@@ -108,7 +108,7 @@ class FollowDetections(AbstractPropagation):
         sizes = jnp.exp(mixture.particles.place[:, 2:])
         unit = jnp.concatenate([sizes, jnp.ones_like(sizes)], axis=1)
         with jax.numpy_rank_promotion("allow"):
-            moved = mixture.particles.predict(*seen.noises, unit)
+            moved = mixture.particles.predict(*seen.noises, unit, 1.0)
         updated, gap, variance = moved.update(place, error)
         log_z = -0.5 * jnp.sum(gap**2 / variance + jnp.log(variance), axis=1)
         offset = log_z - mixture.component_expectations(log_z)[owner]
@@ -213,10 +213,8 @@ def follow_detected(
     deciders = [Decider() for _ in keys]
     mixtures = jax.vmap(filter.init)(keys)
     for t, still in enumerate(stills):
-        boxes = Detections(detector.detect(still)[:MAX_DETECTIONS])
-        found = with_colours(
-            FrameDetections.of(boxes, f"detections: frame {t + 1}", still.shape[:2]), still
-        )
+        boxes = detector.detect(still)[:MAX_DETECTIONS]
+        found = with_colours(FrameDetections.of(boxes, t + 1, still.shape[:2], BOXES), still)
         means = jax.tree.map(np.asarray, _moments(mixtures))
         of_runs = (Gaussian(*rows) for rows in zip(*means, strict=True))
         decided = [each.decide(one, found) for one, each in zip(of_runs, deciders, strict=True)]

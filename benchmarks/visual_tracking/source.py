@@ -72,7 +72,7 @@ def _with_objects(source: Source, box: Sequence[str], ids: Sequence[int] | None)
     rows, first = source.truth, source.first
     started = {int(row[1]): row[2:6] for row in ([] if rows is None else rows) if row[0] == first}
     if box:
-        boxes = np.stack([box_files.parse_box(text, "--box") for text in box])
+        boxes = np.stack([box_files.parse_box(text) for text in box])
         ids = [id for id, own in started.items() if covers(boxes, own[None]).any()]
     elif rows is None:
         raise ValueError("--box: without a gt.txt every object needs its box in the first frame")

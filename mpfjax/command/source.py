@@ -8,41 +8,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpfjax.command.arguments import FORMATS, TRACKS
+from mpfjax.command import FORMATS, TRACKS
 from mpfjax.console import check_outputs
 from mpfjax.vision.files import boxes as box_files
-from mpfjax.vision.files import frames
-from mpfjax.vision.files.sequences import (
-    SequenceInfo,
-    Truth,
-    detection_files,
-    last_frame,
-    read_sequence_info,
-    read_truth,
-    sequence_of,
-)
+from mpfjax.vision.files import frames, sequences
 from mpfjax.vision.tracking.adapters import Rows, first_step
 
 VIDEO, SUMMARY = "tracking.mp4", "summary.json"
-OUTPUTS = (TRACKS, VIDEO, SUMMARY)
 SCORES = ("HOTA", "MOTA", "IDF1")
 NO_SCORES = "no HOTA, MOTA and IDF1"
-_INNER = ("img", "img1")
 _TEXT = (".txt", ".csv")
 _NOT_WITH = {
-    "box": (
-        "max_objects",
-        "min_score",
-        "no_colour",
-        "camera_motion",
-        "offline",
-        "lost_seconds",
-        "classes",
-        "point_deviation",
-        "truth",
-    ),
-    "detect": ("min_score", "classes", "point_deviation"),
-    "point_deviation": ("truth",),
+    "box": "max-objects min-score no-colour camera-motion offline lost-seconds classes"
+    " point-deviation truth",
+    "detect": "min-score classes point-deviation",
+    "point-deviation": "truth",
 }
 
 
@@ -57,7 +37,8 @@ class Source(NamedTuple):
     num_frames: int | None
     frames_per_second: float | None
     frame_size: tuple[int, int] | None  # None where it is unknown before the frames are read
-    truth: Truth | None
+    truth: sequences.Truth | None
+    times: list[float]  # of the frames of a video that have been read, in seconds
 
 
 def check_options(track: argparse.ArgumentParser, options: argparse.Namespace) -> None:
@@ -71,38 +52,35 @@ def check_options(track: argparse.ArgumentParser, options: argparse.Namespace) -
         track.error("one of the arguments --detections --detect --box is required")
     if options.detect and by_pixels:
         track.error("argument --camera-motion pixels: not allowed with --detect")
+    present = {name.replace("_", "-") for name, value in vars(options).items() if value}
     for option, others in _NOT_WITH.items():
-        for name in others if getattr(options, option) else ():
-            if getattr(options, name) not in (None, False):
-                names = (each.replace("_", "-") for each in (name, option))
-                track.error("argument --{}: not allowed with --{}".format(*names))
+        for name in others.split():
+            if {name, option} <= present:
+                track.error(f"argument --{name}: not allowed with --{option}")
 
 
 def open_source(options: argparse.Namespace) -> Source:
     """The source of the frames; a `ValueError` for one that cannot be read."""
-    first, last = frames.parse_range(options.frames, "--frames")
+    first, last = frames.parse_range(options.frames)
     path, has_pixels = options.source, _has_pixels(options.source)
     detections = options.detections if has_pixels else _detections_alone(options)
-    unwritten = () if has_pixels and not options.no_video else (VIDEO,)
-    written = [name for name in (*OUTPUTS, FORMATS[options.format]) if name not in unwritten]
-    check_outputs(
-        options.out,
-        written,
-        {"SOURCE": path, "--detections": detections, "--truth": options.truth},
-    )
+    outputs = [TRACKS, SUMMARY, FORMATS[options.format]]
+    outputs += [VIDEO] if has_pixels and not options.no_video else []
+    inputs = {"SOURCE": path, "--detections": detections, "--truth": options.truth}
+    check_outputs(options.out, outputs, inputs)
     rows, points = None, options.point_deviation is not None
     if detections is not None:
         kinds = {"with_classes": options.classes, "points": points}
         rows = box_files.read_detections(detections, **kinds)
-    folder, info = path, SequenceInfo()
+    folder, info = path, sequences.SequenceInfo()
     if not has_pixels:
-        folder = path if path.is_dir() else sequence_of(path) or path
-        info = read_sequence_info(folder)
+        folder = path if path.is_dir() else _sequence_of(path) or path
+        info = sequences.read_sequence_info(folder)
     unscored, end = points or options.box is not None, last
     truth = None if unscored else find_truth(folder, options.truth, first, last)
     if rows is not None and not has_pixels:
         rows_of_files = [rows[:, :6], *([] if truth is None else [truth.objects])]
-        length = last_frame(info, *rows_of_files)
+        length = sequences.last_frame(info, *rows_of_files)
         if last is None and info.length is None:
             begin = first if options.frames else None
             rate = options.fps or info.frame_rate or 25
@@ -118,10 +96,12 @@ def open_source(options: argparse.Namespace) -> Source:
     if rows is not None and options.frames is not None and last is not None:
         rows = rows[rows[:, 0] <= last]
     rate = options.fps or (frames.frame_rate(path) if has_pixels else info.frame_rate)
-    return Source(path, has_pixels, rows, first, last, num_frames, rate, info.size, truth)
+    return Source(path, has_pixels, rows, first, last, num_frames, rate, info.size, truth, [])
 
 
-def find_truth(source: Path, path: Path | None, first: int, last: int | None) -> Truth | None:
+def find_truth(
+    source: Path, path: Path | None, first: int, last: int | None
+) -> sequences.Truth | None:
     """The ground truth at `path`, or in a folder of images, in these frames; None without one.
 
     A video has no folder, and so no ground truth without a `path`. Warns of a file in the folder
@@ -130,8 +110,9 @@ def find_truth(source: Path, path: Path | None, first: int, last: int | None) ->
     if path is None and not source.is_dir():
         return None
     folder = Path(os.path.abspath(source))
+    folder = folder.parent if folder.name in frames.INNER else folder
     try:
-        truth = read_truth(path or (folder.parent if folder.name in _INNER else folder))
+        truth = sequences.read_truth(path or folder)
     except (ValueError, OSError) as error:
         if path is not None:
             raise
@@ -147,8 +128,15 @@ def find_truth(source: Path, path: Path | None, first: int, last: int | None) ->
 def _has_pixels(path: Path) -> bool:
     """Whether there are frames, and not detections alone."""
     if path.is_dir():
-        return frames.num_images(path) > 0 or not detection_files(path)
+        return frames.num_images(path) > 0 or not sequences.detection_files(path)
     return path.suffix.lower() not in _TEXT
+
+
+def _sequence_of(detections: Path) -> Path | None:
+    """The folder of the sequence to which a file of detections belongs, by its path, or None."""
+    file = detections.absolute()
+    folders = (path for path in file.parents[:2] if file in sequences.detection_files(path))
+    return next(folders, None)
 
 
 def _detections_alone(options: argparse.Namespace) -> Path:
@@ -156,16 +144,15 @@ def _detections_alone(options: argparse.Namespace) -> Path:
     path = options.source
     if options.detections is not None or path.is_file():
         return options.detections or path
-    files = detection_files(path)
+    files = sequences.detection_files(path)
     files = [file for file in files if file.name == "det.txt"] or files
     if len(files) > 1:
         raise ValueError(f"SOURCE: {path} holds {len(files)} files of detections; name one of them")
     return files[0]
 
 
-def read_boxes(options: argparse.Namespace, still: np.ndarray) -> np.ndarray:
+def read_boxes(texts: list[str], still: np.ndarray) -> np.ndarray:
     """The drawn boxes, each of which has to lie in the first frame."""
-    boxes = np.stack([box_files.parse_box(text, "--box") for text in options.box])
+    boxes = np.stack([box_files.parse_box(text) for text in texts])
     height, width, _ = still.shape
-    box_files.check_boxes(boxes, height, width, "--box")
-    return boxes
+    return box_files.check_boxes(boxes, height, width, "--box")

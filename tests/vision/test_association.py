@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.vision.colour.histograms import bhattacharyya
+from mpfjax.vision.colour import bhattacharyya
 from mpfjax.vision.tracking.associate import (
     learned_descriptors,
     mahalanobis,
@@ -32,13 +32,11 @@ def matrix(pairs, none):
 
 def brute_force(odds):
     """The marginals, by summing over all assignments."""
-    m, d = odds.shape
-    total, pairs = 0.0, np.zeros((m, d))
-    for columns in itertools.product(range(-1, d), repeat=m):
-        taken = [column for column in columns if column >= 0]
-        if len(set(taken)) == len(taken):
-            chosen = [(row, column) for row, column in enumerate(columns) if column >= 0]
-            weight = np.prod([odds[pair] for pair in chosen]) if chosen else 1.0
+    total, pairs = 0.0, np.zeros(odds.shape)
+    for columns in itertools.product(range(-1, odds.shape[1]), repeat=len(odds)):
+        chosen = [(row, column) for row, column in enumerate(columns) if column >= 0]
+        if len({column for _, column in chosen}) == len(chosen):
+            weight = np.prod([odds[pair] for pair in chosen])
             total += weight
             for pair in chosen:
                 pairs[pair] += weight
@@ -48,25 +46,14 @@ def brute_force(odds):
 @pytest.mark.parametrize(("loops", "bound"), [(False, 3e-3), (True, 0.15)])
 def test_the_marginals_are_those_of_all_assignments(loops, bound):
     """Exact where the pairs form no loop, to what ends the messages, and else off by .03."""
-    rng = np.random.default_rng(7)
-    gaps = []
+    rng, gaps = np.random.default_rng(7), []
     for _ in range(20):
         log_odds = rng.normal(1, 2, (3, 4))
         if not loops:  # a chain: row 0 with columns 0 and 1, row 1 with 1 and 2, row 2 with 2 and 3
             log_odds[np.abs(np.arange(4)[None] - np.arange(3)[:, None] - 0.5) > 0.5] = -np.inf
-        expected = brute_force(np.exp(log_odds))
-        gaps.append(np.abs(marginals(log_odds) - expected))
+        gaps.append(np.abs(marginals(log_odds) - brute_force(np.exp(log_odds))))
     assert np.max(gaps) < bound
     assert np.mean(gaps) < bound / 5
-
-
-def test_lone_pairs_and_those_with_rivals_have_the_marginals_of_all():
-    rng = np.random.default_rng(3)
-    cost = rng.normal(-2, 5, (9, 8))
-    cost[rng.uniform(0, 1, (9, 8)) > 0.2] = np.inf
-    pairs = possible(cost)
-    probability = matrix(pairs._replace(values=probabilities(pairs)), 0.0)
-    np.testing.assert_allclose(probability, marginals(-cost / 4), atol=1e-6)
 
 
 def test_marginals_of_large_odds_are_those_of_all_assignments():
@@ -76,8 +63,16 @@ def test_marginals_of_large_odds_are_those_of_all_assignments():
         np.testing.assert_allclose(marginals(np.array(log_odds)), expected, atol=0.05)
     huge = np.array([[400.0, 350.0, -np.inf], [-900.0, 20.0, 19.0]])
     np.testing.assert_allclose(marginals(huge), [[1, 0, 0], [0, 0.73, 0.27]], atol=0.01)
-    empty = marginals(np.full((2, 3), -np.inf))
-    np.testing.assert_array_equal(empty, np.zeros((2, 3)))
+    np.testing.assert_array_equal(marginals(np.full((2, 3), -np.inf)), np.zeros((2, 3)))
+
+
+def test_lone_pairs_and_those_with_rivals_have_the_marginals_of_all():
+    rng = np.random.default_rng(3)
+    cost = rng.normal(-2, 5, (9, 8))
+    cost[rng.uniform(0, 1, (9, 8)) > 0.2] = np.inf
+    pairs = possible(cost)
+    probability = matrix(pairs._replace(values=probabilities(pairs, 2.0)), 0.0)
+    np.testing.assert_allclose(probability, marginals(-cost / 4), atol=1e-6)
 
 
 def test_the_assignment_has_the_least_total_cost():
@@ -160,15 +155,9 @@ def test_colours_are_learned_from_who_stands_alone():
 def test_overlap_is_the_share_of_pixels():
     a, b = np.array([[10, 10, 8, 4], [30, 30, 2, 2]]), np.array([[12, 11, 8, 4]])
     grid = np.stack(np.meshgrid(np.arange(60), np.arange(60)), axis=-1) + 0.5
-
-    def inside(box):
-        return (np.abs(grid - box[:2]) < box[2:] / 2).all(axis=-1)
-
-    expected = [
-        [(inside(one) & inside(other)).sum() / (inside(one) | inside(other)).sum() for other in b]
-        for one in a
-    ]
-    shares = matrix(overlapping(1.0 * a, 1.0 * b), 0.0)
+    inside = [(np.abs(grid - box[:2]) < box[2:] / 2).all(axis=-1) for box in (*a, *b)]
+    expected = [[(one & inside[2]).sum() / (one | inside[2]).sum()] for one in inside[:2]]
+    shares = matrix(overlapping(1.0 * a, 1.0 * b, 0.0), 0.0)
     np.testing.assert_allclose(shares, expected, rtol=1e-12)
 
 

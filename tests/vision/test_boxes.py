@@ -60,24 +60,6 @@ def test_the_eighth_column_is_a_class_for_who_says_so(tmp_path):
         read_detections(path, with_classes=True)
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "1,3,10,20,30,40",
-        "1,3,10,20,30,40,1,-1,-1,-1,9",
-        "1,3,ten,20,30,40,1",
-        "-1,3,10,20,30,40,1",
-        "1,3,nan,20,30,40,1",
-        "frame id x y w h",
-    ],
-)
-def test_a_line_that_does_not_parse_is_named(tmp_path, line):
-    path = tmp_path / "gt.txt"
-    path.write_text(f"1,2,10,20,30,40,1,-1,-1,-1\n{line}\n")
-    with pytest.raises(ValueError, match=r"gt\.txt, line 2: "):
-        read_tracks(path)
-
-
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
 def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path, encoding):
     path = tmp_path / "det.txt"

@@ -149,6 +149,9 @@ def test_separators_headers_and_comments_are_read(tmp_path, reader, text):
         ("0,7,1,1,3,4,1\n1,7,1,1,3,4,1", "line 1: .* is not frame"),
         ("1;7;10,5;20;30;40;1", "line 1: .* is not frame"),
         ("1,7,1,1,3,,1", "line 1: .* is not frame"),
+        ("1,7,1,1,3,4,1\n1,3,ten,20,30,40,1", "line 2: .* is not frame"),
+        ("1,7,1,1,3,4,1\n1,3,nan,20,30,40,1", "line 2: .* is not frame"),
+        ("1,7,1,1,3,4,1\n1,3,10,20,30,40,1,-1,-1,-1,9", "line 2: .* is not frame"),
         ("frame,id,x,y,w,h,score\n", "holds no (boxes|detections)"),
     ],
 )

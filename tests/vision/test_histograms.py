@@ -6,8 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.vision.colour.bins import RGBColours
-from mpfjax.vision.colour.histograms import bhattacharyya, integral_histogram, normalise
+from mpfjax.vision.colour import (
+    HSVColours,
+    RGBColours,
+    bhattacharyya,
+    integral_histogram,
+    normalise,
+    sampled_histograms,
+)
 
 
 @eqx.filter_jit
@@ -73,7 +79,7 @@ def test_counts_are_numpys(frame, num_bins, num_parts, wide_counts):
     ],
 )
 def test_a_box_without_pixels_is_empty_and_lies_farthest(frame, box):
-    table = integral_histogram(jnp.asarray(frame), RGBColours(30))
+    table = integral_histogram(jnp.asarray(frame), RGBColours(30), False)
     counts = counted(table, jnp.asarray([box]), 2)
     np.testing.assert_array_equal(np.asarray(counts), 0)
     reference = normalise(counted(table, jnp.asarray([(30.0, 20.0, 20.0, 20.0)]), 2))
@@ -84,9 +90,38 @@ def test_the_table_is_built_once_for_all_runs(frame):
     boxes = jnp.asarray(random_boxes(6)).reshape(2, 3, 4)
 
     def count(frame, boxes):
-        return integral_histogram(frame, RGBColours(8)).counts(boxes)
+        return integral_histogram(frame, RGBColours(8), False).counts(boxes, 1)
 
     program = jax.make_jaxpr(jax.vmap(count, in_axes=(None, 0)))(jnp.asarray(frame), boxes)
     (build,) = [e for e in program.jaxpr.eqns if "table" in str(e.params.get("name"))]
     # Rows, columns and colours, without an axis of runs.
     assert [len(variable.aval.shape) for variable in build.outvars] == [3]
+
+
+# --- from a grid of points in each box ---------------------------------------------------------
+
+SMALL = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+BOXES = np.array(
+    [[20, 15, 10, 12], [3.3, 4.1, 9, 7.5], [38, 28, 12, 9], [20, 15, 90, 70], [15, 10, 0.4, 0.4]]
+)
+
+
+def one_by_one(frame, box, colours, rows, columns, num_parts):
+    bins, (x, y, w, h) = np.asarray(colours.bins(jnp.asarray(frame))), box
+    counts = np.zeros((num_parts, colours.num_channels, colours.num_bins))
+    for i, j in np.ndindex(rows, columns):
+        down = int(np.floor(y + h * ((i + 0.5) / rows - 0.5)))
+        across = int(np.floor(x + w * ((j + 0.5) / columns - 0.5)))
+        if 0 <= down < frame.shape[0] and 0 <= across < frame.shape[1]:
+            for channel in range(colours.num_channels):
+                counts[i * num_parts // rows, channel, bins[down, across, channel]] += 1
+    return counts
+
+
+@pytest.mark.parametrize("colours", [HSVColours(num_hues=4), RGBColours(5)], ids=["hsv", "rgb"])
+@pytest.mark.parametrize("num_parts", [1, 3])
+def test_every_point_counts_once(colours, num_parts):
+    shares = sampled_histograms(SMALL, BOXES, colours, num_parts)
+    expected = np.stack([one_by_one(SMALL, box, colours, 18, 8, num_parts) for box in BOXES])
+    expected /= np.maximum(expected.sum(axis=-1, keepdims=True), 1)
+    np.testing.assert_allclose(shares, expected, rtol=1e-12)

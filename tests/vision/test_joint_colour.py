@@ -8,10 +8,9 @@ import pytest
 
 import mpfjax
 from mpfjax.vision.boxes.joint_colour import joint_colour_model
-from mpfjax.vision.colour.bins import HSVColours, RGBColours
+from mpfjax.vision.colour import HSVColours
 
 KEY = jax.random.key(0)
-COLOURS = HSVColours(num_hues=4, num_saturations=2, num_values=2)
 BOXES = np.array([[10.0, 10, 12, 20], [50, 20, 16, 24], [30, 40, 10, 12]])
 PAINTS = [(220, 20, 20), (20, 20, 220), (20, 200, 40)]
 
@@ -28,7 +27,7 @@ def frame():
 
 @pytest.fixture(scope="module")
 def model(frame):
-    return joint_colour_model(frame, BOXES, colours=COLOURS)
+    return joint_colour_model(frame, BOXES)
 
 
 def states_at(model, *centres):
@@ -44,26 +43,24 @@ def centres(boxes=BOXES):
 
 @pytest.mark.exactness
 def test_the_likelihood_is_the_papers_formula(frame):
-    """Σ_j -λ Σ_parts (1 - Σ_b sqrt(h r)), from numpy's histograms of red, green and blue."""
-    model = joint_colour_model(frame, BOXES, lambda_=7.0, colours=RGBColours(8), num_parts=2)
-    shifts = np.array([[4, 0], [0, -6], [-3, 4]])
+    """Σ_j -λ Σ_halves (1 - Σ_b sqrt(h r)), from numpy's histograms of the bins."""
+    shifts, bins = np.array([[4, 0], [0, -6], [-3, 4]]), np.asarray(HSVColours().bins(frame))
+
+    def histogram(left, top, w, h):
+        counts = np.bincount(bins[top : top + h, left : left + w].ravel(), minlength=110)
+        return counts / counts.sum()
+
     total = 0.0
     for (x, y, w, h), (dx, dy) in zip(BOXES.astype(int), shifts, strict=True):
-        for part in range(2):
-            halves = []
-            for left, top in ((x, y), (x + dx, y + dy)):
-                rows = slice(top + part * h // 2, top + (part + 1) * h // 2)
-                patch = frame[rows, left : left + w].reshape(-1, 3)
-                counts = [np.histogram(patch[:, c], np.arange(9) * 32)[0] for c in range(3)]
-                halves.append(np.array(counts) / len(patch))
-            total += (1 - np.sqrt(halves[0] * halves[1]).sum(axis=1)).sum()
-    assert 1 < total < 15
-    states = states_at(model, *(centres() + shifts))
-    value = eqx.filter_jit(model.log_likelihood)(jnp.asarray(frame), states)
-    np.testing.assert_allclose(value, [-7.0 * total], rtol=1e-4)
-    three = joint_colour_model(frame, BOXES, lambda_=21.0, colours=RGBColours(8), num_parts=2)
-    other = eqx.filter_jit(three.log_likelihood)(jnp.asarray(frame), states)
-    np.testing.assert_allclose(other, 3 * value, rtol=1e-5)
+        for top in (y, y + h // 2):
+            now, template = histogram(x + dx, top + dy, w, h // 2), histogram(x, top, w, h // 2)
+            total += 1 - np.sqrt(now * template).sum()
+    assert 1 < total < 5
+    for lambda_ in (7.0, 21.0):
+        model = joint_colour_model(frame, BOXES, lambda_=lambda_)
+        states = states_at(model, *(centres() + shifts))
+        value = eqx.filter_jit(model.log_likelihood)(jnp.asarray(frame), states)
+        np.testing.assert_allclose(value, [-lambda_ * total], rtol=1e-4)
 
 
 @pytest.mark.exactness
@@ -82,7 +79,7 @@ def test_dynamics_are_the_papers(model):
 @pytest.mark.exactness
 def test_a_template_from_elsewhere(frame):
     """Object 0 starts in the red box and is known by the looks of the blue one."""
-    learned = joint_colour_model(frame, BOXES, colours=COLOURS, templates={0: (frame, BOXES[1])})
+    learned = joint_colour_model(frame, BOXES, templates={0: (frame, BOXES[1])})
     own = learned.object_at(0)
     here, there = (
         learned.object_states(states_at(learned, *places), jnp.asarray(0, jnp.int32))
@@ -96,13 +93,11 @@ def test_a_template_from_elsewhere(frame):
 
 def test_another_lambda_and_order_are_the_same_program(frame):
     """They differ in the values of arrays alone, on which no compilation depends."""
-    one, other = (
+    filters = [
         mpfjax.partitioned_sampling(joint_colour_model(frame, BOXES, lambda_=lambda_), 12, order)
         for lambda_, order in ((10.0, (0, 1, 2)), (40.0, (2, 0, 1)))
-    )
-    arrays, rest = zip(
-        *(eqx.partition(filter, eqx.is_array) for filter in (one, other)), strict=True
-    )
+    ]
+    assert not eqx.tree_equal(*filters)
+    shapes, rest = zip(*(eqx.partition(each, eqx.is_array) for each in filters), strict=True)
     assert eqx.tree_equal(*rest)
-    assert not eqx.tree_equal(*arrays)
-    assert eqx.tree_equal(*(jax.eval_shape(lambda tree=tree: tree) for tree in arrays))
+    assert eqx.tree_equal(*(jax.eval_shape(lambda tree=tree: tree) for tree in shapes))

@@ -1,7 +1,5 @@
 """What the tracker learns, against exact filters, brute force and noises that are known."""
 
-import itertools
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,36 +12,31 @@ from mpfjax.vision.tracking.gaussian import Gaussian, units
 from mpfjax.vision.tracking.lives import Coasting, Duplicates, Spans
 from mpfjax.vision.tracking.noise import _GRID, NoiseState
 from mpfjax.vision.tracking.pairs import Pairs
-from mpfjax.vision.tracking.scores import ScoreState, rising
+from mpfjax.vision.tracking.scores import ScoreState
 
 M = 4
 
 
 def test_a_box_is_filtered_as_by_the_kalman_filter():
     """Along x and y of a box whose size is steady, with noises that are given."""
-    rng = np.random.default_rng(0)
+    rng, moments = np.random.default_rng(0), []
     seen = np.array([30.0, 60, 3, 3.5]) + rng.normal(0, 0.05, (6, 4)) * [1, 1, 0, 0]
-    error, place, velocity = 0.3, 0.02, 0.005
-    now = Gaussian.initial(seen[:1], np.full((1, 4), 0.3), np.full((1, 4), 0.1))
-    unit, got = now.unit[0], []
+    error, place, velocity, speed = (np.full((1, 4), x) for x in (0.3, 0.02, 0.005, 0.1))
+    now = Gaussian.initial(seen[:1], error, speed)
+    unit = now.unit
     for row in seen[1:]:
-        predicted = now.predict(np.full((1, 4), place), np.full((1, 4), velocity), unit)
-        now, _, _ = predicted.update(row[None], np.full((1, 4), error))
-        got.append(np.stack([moment[0] for moment in now]))
+        now, _, _ = now.predict(place, velocity, unit, 1.0).update(row[None], error)
+        moments.append(np.concatenate(now))
     for k in range(2):
         model = mpfjax.LinearGaussianModel(
-            A=np.array([[1.0, 1], [0, 1]]),
-            Q=np.diag([(unit[k] * place) ** 2, (unit[k] * velocity) ** 2]),
-            H=np.array([[1.0, 0.0]]),
-            R=np.array([[error**2]]),
-            m0=np.array([seen[0, k], 0.0]),
-            P0=np.diag([0.3**2, 0.1**2]),
-        )
+            A=np.array([[1.0, 1], [0, 1]]), Q=np.diag(np.square([0.02, 0.005]) * unit[0, k] ** 2),
+            H=np.array([[1.0, 0.0]]), R=np.array([[0.3**2]]),
+            m0=np.array([seen[0, k], 0.0]), P0=np.diag([0.3**2, 0.1**2]),
+        )  # fmt: skip
         run = kalman_filter(model, jnp.asarray(seen[1:, [k]]))
-        moments = np.stack(got)[:, :, k]
-        np.testing.assert_allclose(moments[:, :2], run.means, rtol=1e-4, atol=1e-4)
-        expected = np.asarray(run.covariances)[:, *np.triu_indices(2)]
-        np.testing.assert_allclose(moments[:, 2:], expected, rtol=1e-3, atol=1e-5)
+        covariances = np.asarray(run.covariances)[:, *np.triu_indices(2)]
+        expected = np.concatenate([run.means, covariances], axis=1)
+        np.testing.assert_allclose(np.stack(moments)[:, :, k], expected, rtol=1e-3, atol=1e-4)
 
 
 def test_mixed_moments_are_those_of_the_mixture_of_both():
@@ -59,101 +52,77 @@ def test_mixed_moments_are_those_of_the_mixture_of_both():
 
 # --- noises --------------------------------------------------------------------------------
 
-TRACKER = ObjectTracker(M, frames_per_second=25)
+SIZE = np.array([50.0, 120])
 
 
-def followed(boxes_of_frames, tracker=TRACKER):
-    """The state after these boxes by their centres, one for each object in each frame."""
-    state = tracker.init()
-    for boxes in np.asarray(boxes_of_frames):
-        corners = np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, 2:]], axis=1)
-        state, _ = tracker.step(None, state, None, corners)
-    return state
+def noises_after(centres, sizes=SIZE, rate=25):
+    """The noises after boxes, (t, M, 2) their centres in units of their mean size."""
+    tracker = ObjectTracker(M, frames_per_second=rate)
+    sizes, state = np.broadcast_to(sizes, centres.shape), tracker.init()
+    for boxes in np.concatenate([centres * SIZE - sizes / 2, sizes], axis=2):
+        state, _ = tracker.step(None, state, None, boxes)
+    return state.noise.noises
 
 
 @pytest.mark.parametrize("error", [0.012, 0.04, 0.12])
 def test_the_detectors_errors_are_learned_in_a_second(error):
     """Four objects that walk steadily, and detections that err by so much of a box."""
-    rng = np.random.default_rng(0)
-    start, pace = 400 * np.arange(M)[:, None] + np.ones(2), rng.normal(0, 3, (M, 2))
-    frames = []
-    for t in range(40):
-        noise = rng.normal(0, error, (M, 4))
-        size = np.array([50.0, 120]) * np.exp(noise[:, 2:])
-        frames.append(np.c_[start + pace * t + noise[:, :2] * [50, 120], size])
-    noises = followed(frames).noise.noises
-    assert (np.asarray(noises.errors) < 2 * error).all()
-    assert (np.asarray(noises.errors) > error / 2).all()
-    assert (np.asarray(noises.velocity) < 0.01).all()  # nothing but the detector errs
+    rng, t = np.random.default_rng(0), np.arange(40)[:, None, None]
+    pace, noise = rng.normal(0, 0.04, (M, 2)), rng.normal(0, error, (2, 40, M, 2))
+    centres = 8 * np.arange(M)[:, None] + pace * t + noise[0]
+    noises = noises_after(centres, SIZE * np.exp(noise[1]))
+    assert (noises.errors < 2 * error).all()
+    assert (noises.errors > error / 2).all()
+    assert (noises.velocity < 0.01).all()  # nothing but the detector errs
 
 
 @pytest.mark.exactness
-def test_who_moves_at_random_is_not_taken_for_a_bad_detector():
-    rng = np.random.default_rng(0)
-    walk = np.cumsum(np.cumsum(rng.normal(0, 0.03, (50, M, 2)), axis=0), axis=0) * [50, 120]
-    paths = walk + 900 * np.arange(M)[None, :, None]
-    size = np.tile([50.0, 120], (50, M, 1))
-    noises = followed(np.concatenate([paths, size], axis=2)).noise.noises
-    assert (np.asarray(noises.velocity)[:2] > 0.01).all()
-    assert (np.asarray(noises.errors)[:2] < 0.04).all()
-    assert (np.asarray(noises.velocity)[2:] < 0.006).all()
-
-
-@pytest.mark.exactness
-def test_at_a_low_rate_a_velocity_may_change_by_a_third_of_a_box():
-    """Which no candidate for 25 frames a second has."""
-    turns = np.random.default_rng(0).normal(0, 0.35, (50, M, 2))
-    paths = np.cumsum(np.cumsum(turns, axis=0), axis=0) * [50, 120]
-    paths += 5000 * np.arange(M)[None, :, None]
-    frames = np.concatenate([paths, np.tile([50.0, 120], (50, M, 1))], axis=2)
-    state = followed(frames, ObjectTracker(M, frames_per_second=5))
-    assert (state.noise.noises.velocity[:2] > 0.15).all()
+@pytest.mark.parametrize(("turn", "rate", "least"), [(0.03, 25, 0.01), (0.35, 5, 0.15)])
+def test_who_moves_at_random_is_not_taken_for_a_bad_detector(turn, rate, least):
+    """At a low rate a velocity may change by a third of a box."""
+    turns = np.random.default_rng(0).normal(0, turn, (50, M, 2))
+    centres = np.cumsum(np.cumsum(turns, axis=0), axis=0) + 100 * np.arange(M)[:, None]
+    noises = noises_after(centres, rate=rate)
+    assert (noises.velocity[:2] > least).all()
+    assert (noises.errors[:2] < 0.04).all()
+    assert (noises.velocity[2:] < 0.6 * least).all()
 
 
 def test_each_candidate_is_a_filter_of_its_own_from_the_first_detection_on():
     """Of a box that doubles in eight frames: candidates differ in its size, their unit."""
-    rng = np.random.default_rng(0)
+    rng, speed = np.random.default_rng(0), np.array([0.1, 0.05, 0.05, 0.03])
     seen = np.array([30.0, 60, 3, 3.5]) + np.arange(9)[:, None] * [1, 2, 0.09, 0.08]
     seen += rng.normal(0, 0.05, seen.shape) * [2, 2, 1, 1]
-    speed, nobody = np.array([0.1, 0.05, 0.05, 0.03]), Gaussian.none(4)
-    state = NoiseState.initial(25.0)
-    state = state.renew(np.zeros(0, bool), seen[:1], speed)
-    alone = [
-        Gaussian.initial(seen[:1], units(seen[:1]) * r, units(seen[:1]) * speed)
-        for r, _, _ in _GRID
-    ]
+    state = NoiseState.initial(25.0, 4).renew(np.zeros(0, bool), seen[:1], speed)
     for row in seen[1:]:
-        state = state.predict(1.0).after(np.zeros(1, int), row[None], np.ones(1, bool), nobody)
-        for i, (error, place, velocity) in enumerate(_GRID):
-            now = alone[i].predict(np.full(4, place), np.full(4, velocity), alone[i].unit)
-            alone[i] = now.update(row[None], now.unit * error)[0]
-    expected = np.concatenate([moments.place for moments in alone])
-    assert np.ptp(expected[:, 2]) > 0.1
+        about = np.zeros(1, int), row[None], np.ones(1, bool), Gaussian.none(4)
+        state = state.predict(1.0).after(*about)
+    expected = []
+    for error, place, velocity in _GRID:
+        now = Gaussian.initial(seen[:1], units(seen[:1]) * error, units(seen[:1]) * speed)
+        for row in seen[1:]:
+            now = now.predict(np.full(4, place), np.full(4, velocity), now.unit, 1.0)
+            now = now.update(row[None], now.unit * error)[0]
+        expected.append(now.place[0])
+    assert np.ptp(np.array(expected)[:, 2]) > 0.1
     np.testing.assert_allclose(state.moments.place[0], expected, rtol=1e-12)
 
 
 def test_of_many_objects_the_eldest_tell_the_noises_and_others_follow_when_they_end():
-    rng = np.random.default_rng(0)
+    rng, speed = np.random.default_rng(0), np.full(4, 0.1)
     places = rng.uniform(1, 3, (300, 4))
-    state = NoiseState.initial(25.0).renew(np.zeros(0, bool), places, np.full(4, 0.1))
+    state = NoiseState.initial(25.0, 4).renew(np.zeros(0, bool), places, speed)
     assert state.followed.tolist() == [True] * 128 + [False] * 172
-    stays = np.arange(300) % 2 == 0
-    state = state.renew(stays, places[:100] + 5, np.full(4, 0.1))
-    assert len(state.moments.place) == 128
+    state = state.renew(np.arange(300) % 2 == 0, places[:100] + 5, speed)
     assert state.followed.tolist() == [True] * 64 + [False] * 86 + [True] * 64 + [False] * 36
-    # Detections are those of the objects that are followed, wherever they stand among all.
+    assert len(state.moments.place) == 128
+    # Detections are those of the objects that are followed, wherever they are among all.
     columns = np.full(250, -1)
     columns[[3, 100, 160]] = 0, 1, 2
     seen = np.stack([places[6], places[200], places[10] + 5]) + 0.01
-    after = state.after(columns, seen, np.ones(250, bool), Gaussian.none(4))
-    moved = np.flatnonzero((after.moments.place != renewed_places(places)).any(axis=(1, 2)))
-    np.testing.assert_array_equal(moved, [3, 74])
-
-
-def renewed_places(places):
-    """Of the first 64 even ones of the objects, and of 64 new ones."""
-    at = np.concatenate([places[:128:2], places[:64] + 5])
-    return np.broadcast_to(at[:, None], (128, len(_GRID), 4))
+    before = state.moments.place.copy()
+    after = state.after(columns, seen, np.ones(250, bool), Gaussian.none(4)).moments.place
+    assert np.flatnonzero((after != before).any(axis=(1, 2))).tolist() == [3, 74]
 
 
 # --- the camera ----------------------------------------------------------------------------
@@ -162,61 +131,35 @@ def renewed_places(places):
 @pytest.mark.parametrize("sigma", [0.02, 0.2])
 @pytest.mark.parametrize("num_objects", [2, 8])
 def test_the_mean_product_of_innovations_is_the_cameras_variance(sigma, num_objects):
-    """Objects err on their own by half a box, which must not be taken for the camera's motion."""
-    rng = np.random.default_rng(0)
-    places = np.c_[100.0 * np.arange(num_objects), np.zeros((num_objects, 3))]
-    small = np.full_like(places, 0.02)
-    predicted = Gaussian(places, 0 * places, small, small, small)
-    cost = Pairs.of(-np.eye(num_objects), np.eye(num_objects) > 0)
-    camera, gone, kept = CameraState(), np.zeros((1, 2)), []
+    """Objects err on their own by a tenth of a box, which is not the camera's motion."""
+    rng, camera, squares = np.random.default_rng(0), CameraState(), []
+    variances = np.full((num_objects, 2), 0.02 + 0.1**2)
     for _ in range(600):
         gaps = rng.normal(0, sigma, 2) + rng.normal(0, 0.1, (num_objects, 2))
-        seen = places + np.pad(gaps, [(0, 0), (0, 2)])
-        camera, _ = camera.after(predicted, gone, False, cost, np.full(4, 0.1), seen, np.ones(2))
-        kept.append(camera.deviations**2)
+        camera, _ = camera.after(gaps, variances, 0 * gaps, False, np.ones(2))
+        squares.append(camera.deviations**2)
     # The mean of a few hundred products, of which a thirtieth is forgotten in each frame.
-    learned = np.sqrt(np.mean(kept[200:]))
+    learned = np.sqrt(np.mean(squares[200:]))
     assert learned == pytest.approx(sigma, rel=0.35 if sigma > 0.1 else 1.2)
 
 
 def test_a_shift_of_all_is_the_cameras_and_that_of_one_is_its_own():
-    rows = np.c_[100.0 * np.arange(5), np.zeros((5, 3))]
-    small = np.full_like(rows, 1e-4)
-    predicted = Gaussian(rows, 0 * rows, small, small, small)
-    cost = Pairs.of(-np.eye(5), np.eye(5) > 0)
-    camera = CameraState(np.full(2, 0.5), np.full(2, 0.5), 30.0)
-    seen = rows + np.array([0.7, 0, 0, 0])
-    seen[2, 1] += 3.0
-    gone = np.zeros((1, 2))
-    _, shift = camera.after(predicted, gone, False, cost, np.zeros(4), seen, np.ones(2))
+    camera, gaps = CameraState(np.full(2, 0.5), np.full(2, 0.5), 30.0), np.tile([0.7, 0.0], (5, 1))
+    gaps[2, 1] += 3.0
+    _, shift = camera.after(gaps, np.full((5, 2), 1e-4), 0 * gaps, False, np.ones(2))
     np.testing.assert_allclose(shift, [0.7, 0.0], atol=0.02)
 
 
 # --- scores, coasting, duplicates --------------------------------------------------------------
 
 
-def test_rising_is_the_nearest_sequence_that_does_not_fall():
-    """Against all ways to cut five numbers into blocks of equal values."""
-    rng = np.random.default_rng(0)
-    for _ in range(10):
-        values, weights = rng.normal(size=5), rng.uniform(0.5, 2, 5)
-        best = None
-        for cuts in itertools.product([0, 1], repeat=4):
-            block = np.cumsum([0, *cuts])
-            means = [np.average(values[block == b], weights=weights[block == b]) for b in block]
-            loss = np.sum(weights * (values - means) ** 2)
-            if (np.diff(means) >= -1e-12).all() and (best is None or loss < best[0]):
-                best = loss, means
-        np.testing.assert_allclose(rising(values, weights), best[1], atol=1e-9)
-
-
 def scored(frames, lasting=50):
     """The state after frames of (places of boxes of 10 x 10, scores), the strongest first."""
-    state = ScoreState.initial()
+    state = ScoreState.initial(4, lasting)
     for places, scores in frames:
         boxes = np.array([[*place, 10, 10] for place in places], float)
         apart = Pairs.of(np.eye(len(boxes)), np.eye(len(boxes)) > 0)
-        state = state.after(boxes, np.asarray(scores, float), apart, state.boxes, 1.0, lasting)
+        state = state.after(boxes, np.asarray(scores, float), apart, state.boxes, 1.0, 2.0)
     return state
 
 
@@ -257,7 +200,7 @@ def test_equal_scores_are_all_strong(score):
 
 def test_predictions_are_shown_for_as_long_as_they_were_right():
     """At 25 frames a second: a tenth of one before anything is known."""
-    spans, coasting, ten = Spans.at(25.0), Coasting(), np.full(3, 10.0)
+    spans, coasting, ten = Spans.at(25.0, None), Coasting(), np.full(3, 10.0)
     assert coasting.longest(spans) == 2
     all_three, none = np.ones(3, bool), np.zeros(3, bool)
     right = wrong = coasting

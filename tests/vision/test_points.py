@@ -4,44 +4,9 @@ import numpy as np
 import pytest
 
 from mpfjax.vision import Detections, ObjectTracker, track
+from mpfjax.vision.tracking.associate import Likeness, cosine_distances
 from mpfjax.vision.tracking.track import online_rows
-from mpfjax.vision.tracking.vectors import Likeness, cosine_distances
 from tests.marking import weekly
-
-SIGMA = 2.0
-
-
-def kalman(plots, noises, speed):
-    """The positions of a Kalman filter with a nearly constant velocity, by matrices, along x."""
-    F, H = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
-    m, P, means = np.array([plots[0], 0.0]), np.diag([SIGMA**2, speed**2]), [plots[0]]
-    for plot, (place, velocity) in zip(plots[1:], noises, strict=True):
-        m, P = F @ m, F @ P @ F.T + np.diag([place**2, velocity**2])
-        gain = P @ H.T / (H @ P @ H.T + SIGMA**2)
-        m, P = m + (gain * (plot - H @ m)).ravel(), P - gain @ H @ P
-        means.append(m[0])
-    return np.array(means)
-
-
-def test_two_points_far_apart_are_followed_by_a_kalman_filter_each():
-    rng = np.random.default_rng(0)
-    t = np.arange(30)[:, None, None]
-    truth = np.array([[0.0, 0.0], [9000.0, 5000.0]]) + t * np.array([[6.0, -2.0], [-5.0, 3.0]])
-    plots = truth + SIGMA * rng.standard_normal(truth.shape)
-    tracker = ObjectTracker(4, point_deviation=SIGMA)
-    state, means, noises = tracker.init(), [], []
-    for now in plots:
-        noises.append(state.noise.noises)
-        state, tracks = tracker.step(None, state, None, now)
-        assert tracks.identities.tolist() == [1, 2]
-        means.append(tracks.boxes)
-    for k in range(2):
-        used = [SIGMA * np.array([each.place[k], each.velocity[k]]) for each in noises[1:]]
-        for j in range(2):
-            expected = kalman(plots[:, j, k], used, SIGMA * noises[0].speed[k])
-            np.testing.assert_allclose(np.array(means)[:, j, k], expected, atol=0.02 * SIGMA)
-    errors = np.array(means)[10:] - truth[10:]
-    assert np.sqrt(np.mean(errors**2)) < 0.8 * SIGMA
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3])
@@ -110,30 +75,6 @@ def right_after_a_meeting(crosses, with_vectors, seed):
 def test_look_alikes_in_motion_are_told_apart_by_their_vectors(with_vectors):
     kept = [right_after_a_meeting(way, with_vectors, seed) for way in (0, 1) for seed in range(4)]
     assert all(kept) == with_vectors
-
-
-@pytest.mark.exactness
-def test_an_identity_is_regained_after_a_long_cover():
-    """Walkers behind a wall for three seconds, by their motion; 5% of speed changes at random."""
-    rng = np.random.default_rng(3)
-    place = np.c_[[0.0, 10, 560, 570], [30.0, 120, 70, 190]]
-    speed, kept = np.array([2.5, 3.0, -2.5, -3.0]), {}
-    tracker = ObjectTracker(8, frames_per_second=25, lost_seconds=5)
-    state, hidden = tracker.init(), 0
-    for _ in range(200):
-        speed = speed * (1 + 0.005 * rng.standard_normal(4))
-        place[:, 0] += speed
-        out = np.flatnonzero((place[:, 0] < 180) | (place[:, 0] > 390))
-        boxes = np.c_[
-            place[out] + 0.5 * rng.standard_normal((len(out), 2)), np.tile([20, 40], (len(out), 1))
-        ]
-        hidden += 4 - len(out)
-        state, tracks = tracker.step(None, state, None, boxes)
-        for row, name in zip(tracks.detections, tracks.identities, strict=True):
-            if row >= 0:
-                kept.setdefault(int(out[row]), []).append(int(name))
-    assert hidden > 4 * 60
-    assert all(len(set(names)) == 1 for names in kept.values())
 
 
 def test_the_weight_of_vectors_is_the_odds_of_their_distances():

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from mpfjax.vision import ObjectTracker, Tracks, track
-from mpfjax.vision.boxes.following import follow_boxes
-from mpfjax.vision.tracking.track import offline_rows, online_rows
+from mpfjax.vision.boxes.recipes import follow_boxes
+from mpfjax.vision.tracking.track import _WAITING, offline_rows, online_rows
 
 SHAPE = (48, 64, 3)
 NUM_FRAMES = 8
@@ -69,18 +69,6 @@ def without_pixels():
     return tracked(None, walks())
 
 
-def test_each_object_keeps_one_identity_and_its_place(with_pixels, without_pixels):
-    truth = walks()
-    for run in (with_pixels, without_pixels):
-        assert len(run) == NUM_FRAMES
-        for number, tracks in enumerate(run[1:], 2):
-            rows = online_rows(tracks)
-            assert rows[:, 1].tolist() == [1, 2]
-            # The stronger detection founds the first component.
-            expected = truth[truth[:, 0] == number][::-1, 2:6]
-            np.testing.assert_allclose(rows[:, 2:], expected, atol=3)
-
-
 @pytest.mark.parametrize(
     ("wrap", "ahead"), [(by_frame, False), (detector_of, False), (detector_of, True)]
 )
@@ -90,39 +78,45 @@ def test_every_kind_of_detector_gives_the_same_tracks(wrap, ahead, with_pixels):
 
 
 def test_files_are_tracked_by_their_paths(tmp_path, with_pixels, without_pixels):
-    write_detections(tmp_path / "det.txt")
-    for path in (tmp_path / "det.txt", str(tmp_path / "det.txt")):
-        assert_same(tracked(None, path), without_pixels)
+    path = tmp_path / "det.txt"
+    path.write_text("".join(",".join(map(str, row)) + "\n" for row in walks()))
+    assert_same(tracked(None, path), without_pixels)
+    assert_same(tracked(None, str(path)), without_pixels)
     for number, still in enumerate(stills(), 1):
         Image.fromarray(still).save(tmp_path / f"{number}.png")
     assert_same(tracked(tmp_path, walks()), with_pixels)
 
 
-def write_detections(path):
-    path.write_text("".join(",".join(map(str, row)) + "\n" for row in walks()))
-
-
 def test_frames_ahead_end_with_the_tracks_and_errors_come_in_their_place():
-    read = []
+    """Another thread reads a few frames ahead; warnings and errors are as without it."""
+    read, readers, before = [], set(), threading.active_count()
 
     def camera():
-        for number, still in enumerate(stills(), 1):
-            read.append(number)
-            yield still
-            if number == 6:
-                raise OSError("unplugged")
+        try:
+            for number in range(1, 41):
+                readers.add(threading.current_thread())
+                read.append(number)
+                yield np.zeros(SHAPE, np.uint8)
+            warnings.warn("it is dusk", RuntimeWarning, stacklevel=1)
+            raise OSError("unplugged")
+        finally:
+            read.append("closed")
 
-    before = threading.active_count()
-    tracks = track(camera(), walks(), TRACKER, ahead=True)
+    def run():
+        return track(camera(), lambda frame: np.zeros((0, 4)), TRACKER, ahead=True)
+
+    tracks = run()
     next(tracks)
     tracks.close()
-    assert threading.active_count() == before
-    assert 1 <= len(read) <= 6
-    tracks = track(camera(), walks(), TRACKER, ahead=True)
-    for _ in range(6):
-        next(tracks)
-    with pytest.raises(OSError, match="unplugged"):
-        next(tracks)
+    assert read.pop() == "closed"
+    # Those that wait, the one that was taken, and one in the thread's hands.
+    assert len(read) <= _WAITING + 2
+    tracks = run()
+    with pytest.warns(RuntimeWarning, match="it is dusk"):  # noqa: PT031
+        assert [next(tracks).number for _ in range(40)] == list(range(1, 41))
+        with pytest.raises(OSError, match="unplugged"):
+            next(tracks)
+    assert threading.current_thread() not in readers
     assert threading.active_count() == before
 
 
@@ -148,8 +142,7 @@ def test_what_cannot_be_tracked_is_left_out_with_one_warning(message, what, with
     with pytest.warns(RuntimeWarning, match=message) as caught:
         run = tracked(stills(), np.concatenate([bad, walks()]))
     assert len(caught) == 1
-    assert [tracks.left_out for tracks in run] == [1] * NUM_FRAMES
-    assert_same([tracks._replace(left_out=0) for tracks in run], with_pixels, same_rows=False)
+    assert_same(run, with_pixels, same_rows=False)
 
 
 def test_two_thousand_detections_leave_the_strongest():
@@ -181,45 +174,36 @@ def test_detections_after_the_last_frame_are_told_of():
 
 
 def test_an_error_of_the_detector_says_in_which_frame():
-    def fails(frame):
+    def detector(frame):
         if next(numbers) == 2:
             raise OSError("no network")
         return np.zeros((0, 4))
 
     numbers = itertools.count(1)
-    run = track(stills(), fails, TRACKER)
-    next(run)
     with pytest.raises(OSError, match="no network") as caught:
-        next(run)
+        tracked(stills(), detector)
     assert "detector at frame 2" in str(caught.value)
 
 
 def test_a_damaged_frame_is_predicted_and_later_ones_keep_their_numbers():
-    frames, asked = [*stills()], []
+    frames = [*stills()]
     frames[2] = None
-
-    def detector(frame):
-        asked.append(frame)
-        return [[10.0 + len(asked), 10, 12, 20]]
-
-    tracks = list(track(frames, detector, TRACKER))
-    assert len(tracks) == len(frames) == len(asked) + 1
+    boxes = iter([[[10.0 + t, 10, 12, 20]] for t in range(NUM_FRAMES - 1)])
+    tracks = list(track(frames, lambda frame: next(boxes), TRACKER))
     assert all(1 in each.identities for each in tracks)
-    assert [bool((each.detections >= 0).any()) for each in tracks] == [
-        frame is not None for frame in frames
-    ]
+    found = [bool((each.detections >= 0).any()) for each in tracks]
+    assert found == [frame is not None for frame in frames]
+
+
+# --- which frames there are -----------------------------------------------------------------------
 
 
 def test_a_frame_that_a_mapping_has_not_is_one_without_a_detector():
     """As None in the place of boxes is."""
-    frames = list(by_frame(walks()))
-    some = {number: found for number, found in enumerate(frames, 1) if number not in (4, 6)}
+    some = {n: each for n, each in enumerate(by_frame(walks()), 1) if n not in (4, 6)}
     listed = [some.get(number) for number in range(1, NUM_FRAMES + 1)]
     assert_same(tracked(None, some), tracked(None, listed))
     assert all(tracks.shown.sum() == 2 for tracks in tracked(None, some))
-
-
-# --- which frames there are -----------------------------------------------------------------------
 
 
 def rows_at(*numbers):
@@ -241,17 +225,16 @@ def test_steps_without_pixels_begin_at_the_first_row(numbers, steps):
 @pytest.mark.parametrize(
     ("numbers", "options", "named"),
     [
-        ((2, 1, 99_999), {}, "row 2, of frame 99999, comes 99997 frames after what is before it"),
-        ((99_999,), {"first": 7}, "row 0, of frame 99999, comes 99992 frames after frame 7"),
-        ((1, 1502), {}, "row 1, .* a minute has 1500"),
+        ((2, 1, 99_999), {}, "frame 99999 comes 99997 frames after frame 2"),
+        ((99_999,), {"first": 7}, "frame 99999 comes 99992 frames after frame 7"),
+        ((1, 1502), {}, "frame 1502 .* a minute has 1500"),
     ],
 )
 def test_a_row_that_is_a_minute_later_is_named(numbers, options, named):
-    with pytest.raises(ValueError, match=f"detections: .*{named}"):
-        track(None, rows_at(*numbers), **options)
     by_number = {number: rows_at(number)[:, 2:6] for number in numbers}
-    with pytest.raises(ValueError, match=r"detections: frame .*, and a minute has 1500"):
-        track(None, by_number, **options)
+    for detections in (rows_at(*numbers), by_number):
+        with pytest.raises(ValueError, match=f"detections: {named}"):
+            track(None, detections, **options)
 
 
 def test_a_minute_without_rows_passes_where_it_is_filmed_or_less():
@@ -266,50 +249,40 @@ def test_a_minute_without_rows_passes_where_it_is_filmed_or_less():
 
 
 def test_tracks_say_which_row_each_object_took_whatever_the_order_and_what_is_left_out():
-    rows = walks()
+    rows, flat, labels = walks(), [0.0, 0, 0, 5], []
     order = np.random.default_rng(0).permuted(np.tile(np.arange(3), (NUM_FRAMES, 1)), axis=1)
-    flat = [0.0, 0, 0, 5]
     frames = [
         np.array([*rows[rows[:, 0] == t + 1, 2:6], flat])[order[t]] for t in range(NUM_FRAMES)
     ]
     with pytest.warns(RuntimeWarning, match="frame 1, row ., .* of no area"):
-        found = tracked(None, frames)
-    labels = [
-        {int(tracks.identities[m]): order[t][tracks.detections[m]] for m in range(2)}
-        for t, tracks in enumerate(found)
-    ]
+        found = tracked(None, [*frames, np.zeros((0, 4))])
+    for tracks, names in zip(found, order, strict=False):
+        labels.append(dict(zip(tracks.identities.tolist(), names[tracks.detections], strict=True)))
     assert all(each == labels[0] and set(each.values()) == {0, 1} for each in labels)
-    assert (found[-1].detections[found[-1].identities == 0] == -1).all()
-    gone = tracked(None, [*frames[:2], np.zeros((0, 4))])
-    assert (gone[-1].detections == -1).all()
+    assert (found[-1].detections == -1).all()
 
 
 # --- rows, trackers, drawn boxes -----------------------------------------------------------------
 
 
-def said(number, identities, confirmed, shown):
-    boxes = np.tile([10.0, 20.0, 4.0, 8.0], (len(identities), 1))
-    unseen = np.zeros(len(identities), int)
-    return Tracks(
-        boxes, np.array(identities), np.array(confirmed), unseen, np.array(False), np.array(shown),
-        np.full(len(identities), -1), np.zeros(len(identities)), unseen, np.ones(len(identities)),
-        number=number,
-    )  # fmt: skip
-
-
 def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_the_end():
-    nobody = [False, False, False]
-    kept = [
-        said(5, [2, 1, 0], nobody, nobody),
-        said(6, [2, 1, 3], [False, True, False], [False, True, False]),
-        said(7, [0, 1, 3], [False, True, True], nobody),  # 3 is believed, but for a double
-    ]
-    online = np.concatenate([online_rows(tracks) for tracks in kept])
+    boxes, none = np.tile([10.0, 20.0, 4.0, 8.0], (3, 1)), np.zeros(3, int)
+    tracks = [
+        Tracks(
+            boxes, np.array(identities), np.array(confirmed) > 0, none, False,
+            np.array(shown) > 0, none - 1, 0.0 * none, none, 1.0 + none, number,
+        )
+        for number, identities, confirmed, shown in (
+            (5, [2, 1, 0], [0, 0, 0], [0, 0, 0]),
+            (6, [2, 1, 3], [0, 1, 0], [0, 1, 0]),
+            (7, [0, 1, 3], [0, 1, 1], [0, 0, 0]),  # 3 is an object, but for a duplicate
+        )
+    ]  # fmt: skip
+    online = np.concatenate([online_rows(each) for each in tracks])
     assert online.tolist() == [[6, 1, 8, 16, 4, 8]]
-    offline = offline_rows(kept)
-    assert offline[:, :2].tolist() == [[5, 1], [6, 1]]
+    assert offline_rows(tracks)[:, :2].tolist() == [[5, 1], [6, 1]]
     assert offline_rows([]).shape == (0, 6)
-    assert online_rows(kept[1], described=True).tolist() == [[6, 1, 8, 16, 4, 8, 1, 0]]
+    assert online_rows(tracks[1], described=True).tolist() == [[6, 1, 8, 16, 4, 8, 1, 0]]
 
 
 @pytest.mark.parametrize(
@@ -338,13 +311,11 @@ def test_a_first_row_is_shown_at_once_where_its_score_is_no_low_one():
 
 def test_tracks_have_the_number_of_their_frame():
     rows = walks()
-    late = rows[rows[:, 0] > 2]
-    assert [tracks.number for tracks in track(None, late)] == list(range(3, NUM_FRAMES + 1))
-    ours = np.concatenate([online_rows(tracks) for tracks in track(None, late)])
-    assert ours[0, 0] == 3
+    late = list(track(None, rows[rows[:, 0] > 2]))
+    assert [tracks.number for tracks in late] == list(range(3, NUM_FRAMES + 1))
+    assert online_rows(late[0])[0, 0] == 3
     tracker = ObjectTracker()
-    _, tracks = tracker.step(None, tracker.init(), None, None)
-    assert tracks.number == 1
+    assert tracker.step(None, tracker.init(), None, None)[1].number == 1
 
 
 @pytest.mark.exactness
@@ -354,7 +325,7 @@ def test_drawn_boxes_give_one_track_each_in_the_order_given():
     frames[1] = None  # it cannot be decoded
     run = list(follow_boxes(frames, first[::-1]))
     assert len(run) == len(frames)
-    with pytest.raises(ValueError, match="frames: the first, in which the boxes are, is None"):
+    with pytest.raises(ValueError, match="frames: there is no first one, in which the boxes are"):
         next(follow_boxes([None], first))
     for number, tracks in enumerate(run, 1):
         assert tracks.number == number
@@ -369,10 +340,9 @@ def test_frames_move_objects_by_the_time_between_them():
     times = np.cumsum([0.1, 0.4] * 12)
     boxes = [np.array([[60 * time, 20.0, 30.0, 60.0]]) for time in times]
     tracker = ObjectTracker(3, frames_per_second=10)
-    *_, steady = track(None, boxes, tracker, times=times)
-    assert steady.identities.tolist() == [1]
-    unseen = [*boxes[:-1], None]  # where no detector ran, it is predicted
-    *_, ahead = track(None, unseen, tracker, times=times)
+    # In the last frame no detector ran, and it is predicted.
+    *_, before, ahead = track(None, [*boxes[:-1], None], tracker, times=times)
+    assert before.identities.tolist() == [1]
     assert ahead.corner_boxes[0, 0] == pytest.approx(60 * times[-1], abs=3)
     with pytest.raises(ValueError, match="time: "):
         list(track(None, boxes, tracker, times=times[::-1]))

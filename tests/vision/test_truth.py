@@ -81,25 +81,17 @@ def test_scores_are_those_of_trackevals_reader_of_motchallenge(tmp_path, benchma
     tracks = found(rng, boxes[:, : classes.index(12)])
     (tmp_path / "trackers" / "ours" / "data").mkdir(parents=True)
     write_tracks(tmp_path / "trackers" / "ours" / "data" / f"{name}.txt", tracks)
-    dataset = datasets.MotChallenge2DBox(
-        {
-            "GT_FOLDER": str(tmp_path / "gt"),
-            "TRACKERS_FOLDER": str(tmp_path / "trackers"),
-            "BENCHMARK": benchmark,
-            "SEQ_INFO": {name: NUM_FRAMES},
-            "SKIP_SPLIT_FOL": True,
-            "PRINT_CONFIG": False,
-        }
-    )
-    truth = read_truth(folder)
+    dataset, truth = datasets.MotChallenge2DBox({
+        "GT_FOLDER": str(tmp_path / "gt"), "TRACKERS_FOLDER": str(tmp_path / "trackers"),
+        "BENCHMARK": benchmark, "SEQ_INFO": {name: NUM_FRAMES}, "SKIP_SPLIT_FOL": True,
+        "PRINT_CONFIG": False,
+    }), read_truth(folder)  # fmt: skip
     expected = trackeval_scores(dataset, name, "pedestrian")
     assert ours(tracks, truth) == pytest.approx({score: expected[score] for score in SCORES})
     if benchmark == "MOT15":
         assert len(truth.ignored) == 0
     else:
-        with pytest.warns(RuntimeWarning, match="rows are flagged 0"):
-            rows = read_tracks(folder / "gt" / "gt.txt")
-        every = multi_object_scores(tracks, rows)
+        every = multi_object_scores(tracks, read_tracks(folder / "gt" / "gt.txt"))
         assert abs(every["MOTA"] - expected["MOTA"]) > 0.02, "nothing was there to be ignored"
 
 
@@ -112,7 +104,7 @@ def test_scores_are_those_of_trackevals_reader_of_kitti(tmp_path, kind):
     names = [kind.capitalize()] * 9 + [other] * 4
     boxes = walking(rng, len(names))
     regions = np.column_stack([rng.uniform(0, 300, (3, 2)), rng.uniform(40, 90, (3, 2))])
-    label, result, objects, ignored = [], [], [], []
+    label, objects, ignored = [], [], []
 
     def line(frame, id, name, truncated, occluded, box):
         corners = " ".join(f"{v:.3f}" for v in (*box[:2], *(box[:2] + box[2:])))
@@ -128,28 +120,23 @@ def test_scores_are_those_of_trackevals_reader_of_kitti(tmp_path, kind):
             label.append(line(frame, -1, "DontCare", -1, -1, box) + "\n")
             ignored.append([frame, 2, *box])
     tracks = found(rng, boxes)
-    for frame, id, *box in tracks:
-        result.append(line(int(frame), int(id), kind, -1, -1, np.array(box)) + " 0.9\n")
+    rows = [(int(frame), int(id), kind, -1, -1, np.array(box)) for frame, id, *box in tracks]
+    result = [line(*row) + " 0.9\n" for row in rows]
     folder, results = tmp_path / "gt", tmp_path / "trackers" / "ours" / "data"
     (folder / "label_02").mkdir(parents=True)
     results.mkdir(parents=True)
     (folder / "label_02" / "0000.txt").write_text("".join(label))
     (folder / "evaluate_tracking.seqmap.training").write_text(f"0000 empty 0 {NUM_FRAMES}\n" * 2)
     (results / "0000.txt").write_text("".join(result))
-    settings = {
-        "GT_FOLDER": str(folder),
-        "TRACKERS_FOLDER": str(tmp_path / "trackers"),
-        "CLASSES_TO_EVAL": [kind],
-        "PRINT_CONFIG": False,
-    }
-    dataset = datasets.Kitti2DBox(settings)
+    dataset = datasets.Kitti2DBox({
+        "GT_FOLDER": str(folder), "TRACKERS_FOLDER": str(tmp_path / "trackers"),
+        "CLASSES_TO_EVAL": [kind], "PRINT_CONFIG": False,
+    })  # fmt: skip
     # The same as our own files have it.
     own = tmp_path / "kitti_0000"
     own.mkdir()
     write_tracks(own / "gt.txt", np.array(objects))
-    (own / "ignore.txt").write_text(
-        "".join(",".join(map(str, [int(row[0]), *row[1:]])) + "\n" for row in ignored)
-    )
+    np.savetxt(own / "ignore.txt", np.array(ignored), "%.9g", ",")
     truth = read_truth(own)
     assert truth.min_height == 25
     expected = trackeval_scores(dataset, "0000", kind)

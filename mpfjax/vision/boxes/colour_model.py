@@ -12,12 +12,13 @@ from mpfjax.checks import Count, NotNegative, Positive, Renamed, Share, checked,
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 from mpfjax.operations.random import fast_key
-from mpfjax.vision.colour.bins import AbstractColours, RGBColours
-from mpfjax.vision.colour.histograms import (
+from mpfjax.vision.colour import (
     LARGEST_NARROW,
     SURROUND,
+    Colours,
     Histograms,
     IntegralHistogram,
+    RGBColours,
     bhattacharyya,
     integral_histogram,
     normalise,
@@ -47,18 +48,123 @@ class BoxState(eqx.Module):
     appearance: Float[Array, "*n parts channels bins"] | None = None
 
 
-class AbstractBoxModel(AbstractStateSpaceModel):
-    """The motion of boxes, without a likelihood.
+class ColourModel(AbstractStateSpaceModel):
+    """Boxes that move at random and are recognised by the colours in them.
 
-    x_0 is Gaussian about the reference boxes, with equally many particles for each. (x, y, s_x,
-    s_y) follow the dynamics. In each frame, r is drawn again with the switch probability, which may
-    be zero.
+    Vermaak et al. (2003), section 5.2: (x, y, s_x, s_y) follow independent Gaussian random walks,
+    and
+
+        L(y | x) ∝ exp(-Σ_c B²(h^c, h_ref^c) / 2σ²)
+
+    where B is the Bhattacharyya distance of the normalised histograms of the colours c = R, G, B in
+    the hypothesised and in the reference box. Lin et al. (2012), section 2, is the same with one
+    `HSVColours` histogram (eqs. 1 to 3) and an `Autoregression` (eq. 4). Two extensions are in
+    neither paper, and off by default:
+
+    - several references: r, the reference with which a particle is compared, is part of the state,
+      so that the recursion remains exact. x_0 is distributed equally over all references. r never
+      changes, or is redrawn with a small probability in every frame, for objects that change their
+      appearance;
+    - boxes divided into bands from top to bottom, whose B² are averaged, so that a shirt is not
+      confused with trousers; and weights of colours: a colour has more weight the larger its share
+      in a reference box is, compared with the surroundings of the box. Grass in a box then has
+      little weight.
+
+    An observation is an RGB frame, uint8 of shape (h, w, 3), or its `IntegralHistogram`. A box
+    outside the frame has no colour and the largest distance, B = 1. So has a box of more pixels
+    than can be counted, see `wide_counts`. Make a model with `from_frame`. Use it for objects that
+    keep their colours and are not surrounded by the same colours.
+
+    - `reference_boxes`: (k, 4), centre and size in pixels; x_0 is Gaussian about them.
+    - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, channels,
+      bins).
+    - `dynamics`: of (x, y, s_x, s_y), in pixels for x and y and in units of the reference box for
+      s_x and s_y; its parameters have a leading axis k.
+    - `initial_deviations`: standard deviations of x_0, (k, 4), in the same units.
+    - `sigma`: σ, the width of the likelihood.
+    - `colours`: the bins of the histograms.
+    - `switch_probability`: the probability, in each frame, that r is redrawn from all references.
+    - `contrast`: how much the log-likelihood increases if the areas at both sides of a box, half a
+      width each, do not have the reference's colours. 0 uses only the box, as in the paper. A box
+      that is too large to be counted together with its sides has no increase.
+    - `wide_counts`: count pixels in 32 bits; see `integral_histogram`. Without it, a box, or with
+      `contrast` a box with its sides, may have at most 65 535 pixels.
     """
 
-    reference_boxes: eqx.AbstractVar[Float[Array, "k 4"]]
-    dynamics: eqx.AbstractVar[AbstractDynamics]
-    initial_deviations: eqx.AbstractVar[Float[Array, "k 4"]]
-    switch_probability: eqx.AbstractVar[float]
+    reference_boxes: Float[Array, "k 4"]
+    references: Float[Array, "k parts channels bins"]
+    colour_weights: Float[Array, "k parts channels bins"]
+    dynamics: AbstractDynamics
+    initial_deviations: Float[Array, "k 4"]
+    sigma: Float[Array, ""]
+    colours: Colours
+    switch_probability: Share = eqx.field(static=True)
+    contrast: NotNegative = eqx.field(static=True)
+    wide_counts: bool = eqx.field(static=True)
+
+    @classmethod
+    @checked
+    def from_frame(
+        cls,
+        frame: UInt8[np.ndarray, "h w 3"],
+        boxes: Float[np.ndarray, "k 4"],
+        *,
+        colours: Colours | None = None,
+        sigma: Positive = 0.15,
+        deviations: Float[np.ndarray, "..."] | None = None,
+        dynamics: AbstractDynamics | None = None,
+        num_parts: Count = 1,
+        weigh_colours: bool = False,
+        share_reference: bool = False,
+        switch_probability: Share = 0.0,
+        contrast: NotNegative = 0.0,
+    ) -> "ColourModel":
+        """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
+
+        - `colours`: the bins of the histograms; None is `RGBColours()`.
+        - `deviations`: standard deviations of x_0 and of the random walk, (4,) or one row per box;
+          None is the paper's, the roots of (2.5, 1.5, 0.05, 0.05).
+        - `dynamics`: instead of the random walk; one for all boxes, or with a row for each.
+        - `num_parts`: bands from top to bottom.
+        - `weigh_colours`: weight each colour by its share in the box relative to its share in the
+          surroundings, a box of twice the width and height.
+        - `share_reference`: compare all particles with one reference, the mean of all boxes. The
+          paper also has one B_ref for all players.
+        - `switch_probability`, `contrast`: see the class.
+
+        Raises `ValueError`, with the name of the argument, for an argument of another kind, for a
+        frame that is not (h, w, 3) of type uint8, for a box without area or outside the frame, for
+        a number that is not positive, and for a probability outside [0, 1].
+        """
+        check_frame(frame)
+        boxes = check_boxes(boxes, *frame.shape[:2])
+        colours = RGBColours() if colours is None else colours
+        deviations = np.sqrt(PAPER_VARIANCES) if deviations is None else deviations
+        steps = jnp.asarray(positive_deviations(deviations, len(boxes)), float)
+        steps = jnp.broadcast_to(steps, (len(boxes), 4))
+        places = jnp.asarray(to_centre(boxes), float)
+        # Room for boxes to grow to twice the area of the largest reference.
+        room = 2 * np.prod(boxes[:, 2:] + 1, axis=1).max()
+        if contrast > 0 or weigh_colours:
+            room *= SURROUND
+        wide_counts = bool(room > LARGEST_NARROW)
+        table = integral_histogram(jnp.asarray(frame), colours, wide_counts)
+        references, weights = reference_histograms(table, places, num_parts, weigh_colours)
+        if share_reference:
+            references = jnp.broadcast_to(references.mean(0, keepdims=True), references.shape)
+            places = places.at[:, 2:].set(places[:, 2:].mean(0, keepdims=True))
+        return cls(
+            reference_boxes=places,
+            references=references,
+            colour_weights=weights,
+            dynamics=_for_each(RandomWalk(steps) if dynamics is None else dynamics, len(boxes)),
+            initial_deviations=steps,
+            sigma=jnp.asarray(sigma, float),
+            colours=colours,
+            switch_probability=switch_probability,
+            contrast=contrast,
+            wide_counts=wide_counts,
+        )
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
         """x_0 about the reference boxes, equally many for each, at scale one."""
@@ -109,123 +215,6 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         """(x, y, s_x l_x, s_y l_y): the hypothesised boxes, centre and size in pixels."""
         size = self.reference_boxes[states.reference, 2:]
         return jnp.concatenate([states.box[:, :2], states.box[:, 2:] * size], axis=1)
-
-
-class ColourModel(AbstractBoxModel):
-    """Boxes that move at random and are recognised by the colours in them.
-
-    Vermaak et al. (2003), section 5.2: (x, y, s_x, s_y) follow independent Gaussian random walks,
-    and
-
-        L(y | x) ∝ exp(-Σ_c B²(h^c, h_ref^c) / 2σ²)
-
-    where B is the Bhattacharyya distance of the normalised histograms of the colours c = R, G, B in
-    the hypothesised and in the reference box. Lin et al. (2012), section 2, is the same with one
-    `HSVColours` histogram (eqs. 1 to 3) and an `Autoregression` (eq. 4). Two extensions are in
-    neither paper, and off by default:
-
-    - several references: r, the reference with which a particle is compared, is part of the state,
-      so that the recursion remains exact. x_0 is distributed equally over all references. r never
-      changes, or is redrawn with a small probability in every frame, for objects that change their
-      appearance;
-    - boxes divided into bands from top to bottom, whose B² are averaged, so that a shirt is not
-      confused with trousers; and weights of colours: a colour has more weight the larger its share
-      in a reference box is, compared with the surroundings of the box. Grass in a box then has
-      little weight.
-
-    An observation is an RGB frame, uint8 of shape (h, w, 3), or its `IntegralHistogram`. A box
-    outside the frame has no colour and the largest distance, B = 1. So has a box of more pixels
-    than can be counted, see `wide_counts`. Make a model with `from_frame`. Use it for objects that
-    keep their colours and are not surrounded by the same colours.
-
-    - `reference_boxes`: (k, 4), centre and size in pixels; x_0 is Gaussian about them.
-    - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, channels,
-      bins).
-    - `dynamics`: of (x, y, s_x, s_y), in pixels for x and y and in units of the reference box for
-      s_x and s_y; its parameters have a leading axis k.
-    - `initial_deviations`: standard deviations of x_0, (k, 4), in the same units.
-    - `sigma`: σ, the width of the likelihood.
-    - `colours`: the bins of the histograms.
-    - `switch_probability`: the probability, in each frame, that r is redrawn from all references.
-    - `contrast`: how much the log-likelihood increases if the areas at both sides of a box, half a
-      width each, do not have the reference's colours. 0 uses only the box, as in the paper. A box
-      that is too large to be counted together with its sides has no increase.
-    - `wide_counts`: count pixels in 32 bits; see `integral_histogram`. Without it, a box, or with
-      `contrast` a box with its sides, may have at most 65 535 pixels.
-    """
-
-    reference_boxes: Float[Array, "k 4"]
-    references: Float[Array, "k parts channels bins"]
-    colour_weights: Float[Array, "k parts channels bins"]
-    dynamics: AbstractDynamics
-    initial_deviations: Float[Array, "k 4"]
-    sigma: Float[Array, ""]
-    colours: AbstractColours
-    switch_probability: Share = eqx.field(static=True, default=0.0, kw_only=True)
-    contrast: NotNegative = eqx.field(static=True, default=0.0, kw_only=True)
-    wide_counts: bool = eqx.field(static=True, default=False, kw_only=True)
-
-    @classmethod
-    @checked
-    def from_frame(
-        cls,
-        frame: UInt8[np.ndarray, "h w 3"],
-        boxes: Float[np.ndarray, "k 4"],
-        *,
-        colours: AbstractColours | None = None,
-        sigma: Positive = 0.15,
-        deviations: Float[np.ndarray, "..."] | None = None,
-        dynamics: AbstractDynamics | None = None,
-        num_parts: Count = 1,
-        weigh_colours: bool = False,
-        share_reference: bool = False,
-        switch_probability: Share = 0.0,
-        contrast: NotNegative = 0.0,
-    ) -> "ColourModel":
-        """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
-
-        - `colours`: the bins of the histograms; None is `RGBColours()`.
-        - `deviations`: standard deviations of x_0 and of the random walk, (4,) or one row per box;
-          None is the paper's, the roots of (2.5, 1.5, 0.05, 0.05).
-        - `dynamics`: instead of the random walk; one for all boxes, or with a row for each.
-        - `num_parts`: bands from top to bottom.
-        - `weigh_colours`: weight each colour by its share in the box relative to its share in the
-          surroundings, a box of twice the width and height.
-        - `share_reference`: compare all particles with one reference, the mean of all boxes. The
-          paper also has one B_ref for all players.
-        - `switch_probability`, `contrast`: see the class.
-
-        Raises `ValueError`, with the name of the argument, for an argument of another kind, for a
-        frame that is not (h, w, 3) of type uint8, for a box without area or outside the frame, for
-        a number that is not positive, and for a probability outside [0, 1].
-        """
-        check_frame(frame)
-        boxes = check_boxes(boxes, *frame.shape[:2])
-        colours = RGBColours() if colours is None else colours
-        deviations = positive_deviations(
-            np.sqrt(PAPER_VARIANCES) if deviations is None else deviations, len(boxes)
-        )
-        places = jnp.asarray(to_centre(boxes), float)
-        references, weights = reference_histograms(frame, colours, places, num_parts, weigh_colours)
-        if share_reference:
-            references = jnp.broadcast_to(references.mean(0, keepdims=True), references.shape)
-            size = places[:, 2:].mean(0, keepdims=True)
-            places = places.at[:, 2:].set(jnp.broadcast_to(size, (len(boxes), 2)))
-        steps = jnp.broadcast_to(jnp.asarray(deviations, float), (len(boxes), 4))
-        # Room for boxes to grow to twice the area of the largest reference.
-        room = 2 * np.prod(boxes[:, 2:], axis=1).max() * (SURROUND if contrast > 0 else 1)
-        return cls(
-            reference_boxes=places,
-            references=references,
-            colour_weights=weights,
-            dynamics=_for_each(RandomWalk(steps) if dynamics is None else dynamics, len(boxes)),
-            initial_deviations=steps,
-            sigma=jnp.asarray(sigma, float),
-            colours=colours,
-            switch_probability=switch_probability,
-            contrast=contrast,
-            wide_counts=bool(room > LARGEST_NARROW),
-        )
 
     def log_likelihood(self, observation: Seen, states: BoxState) -> Float[Array, " n"]:
         """-(Σ_c B² - contrast Σ_c B²_around) / 2σ², each B² averaged over the bands."""

@@ -12,7 +12,12 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation, Step, is_missing
 from mpfjax.moves.regrouping.features import component_groups
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel, Seen
-from mpfjax.vision.colour.histograms import Histograms, normalise
+from mpfjax.vision.colour import Histograms, normalise
+
+_ANCHOR = 0.2  # the share of the distance from the reference of the first frame
+# d_hidden, squared, in units of Σ_c B². In a street scene, people were at a distance of .2 from
+# themselves, .5 to .7 from others and 1 or more from the background.
+_HIDDEN = 0.6
 
 
 class LearnedColourModel(ColourModel):
@@ -20,21 +25,15 @@ class LearnedColourModel(ColourModel):
 
         L(y | x) ∝ exp(-d / 2σ²) + exp(-d_hidden / 2σ²)
 
-    d is the squared distance of a `ColourModel`, including contrast: a share `anchor` of it is
-    the distance from the reference of the first frame, and the rest the distance from the
-    particle's own `appearance`. The second term stands for a hidden object, and does not depend on
+    d is the squared distance of a `ColourModel`, including contrast: a fifth of it is the distance
+    from the reference of the first frame, and the rest the distance from the particle's own
+    `appearance`. The second term stands for a hidden object, and does not depend on
     the box. A hypothesis therefore stays near the place where its object vanished, and no
     look-alike at a distance of d_hidden or more attracts it. `appearance` is part of the state, and
     only `AdaptAppearance` changes it. All else is as in a `ColourModel`.
 
-    - `hidden_distance`: d_hidden, squared, in units of Σ_c B². In a street scene, people were at a
-      distance of .2 from themselves, .5 to .7 from others and 1 or more from the background.
-
     Use it where objects hide behind others or turn round.
     """
-
-    anchor: float = eqx.field(static=True, default=0.2)
-    hidden_distance: float = eqx.field(static=True, default=0.6)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
         """x_0 of the `ColourModel`, with the appearance of the reference."""
@@ -69,8 +68,8 @@ class LearnedColourModel(ColourModel):
         appearance = states.appearance
         assert appearance is not None
         to_learned = self.distances(counts, sides, weights, appearance)
-        distances = self.anchor * to_first + (1 - self.anchor) * to_learned
-        log_hidden = -0.5 * self.hidden_distance / self.sigma**2
+        distances = _ANCHOR * to_first + (1 - _ANCHOR) * to_learned
+        log_hidden = -0.5 * _HIDDEN / self.sigma**2
         return -0.5 * distances / self.sigma**2, log_hidden.astype(distances.dtype), counts
 
 
@@ -80,13 +79,13 @@ class AdaptAppearance(AbstractPropagation):
         appearance <- appearance + rate · P(seen | x, y) (h(x) - appearance)
 
     P(seen | x, y) is the share of the first term in the likelihood of the `LearnedColourModel`.
-    Rival hypotheses learn different appearances. The `anchor` of the model keeps a share of the
-    first frame's. The weights do not change.
+    Rival hypotheses learn different appearances. A share of the first frame's remains in
+    the model. The weights do not change.
 
     The model changes with the data (`approximate` is true). Use it after `Propagate`.
     """
 
-    rate: float = eqx.field(static=True, default=0.1)
+    rate: float = eqx.field(static=True)
 
     approximate = True
     """appearances are learned from the same data that they explain."""

@@ -9,16 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt8
 
-from mpfjax.arrays import (
-    to_rows,
-)
-from mpfjax.checks import Count, Positive, check_shape, checked
+from mpfjax.arrays import to_rows
+from mpfjax.checks import Positive, check_shape, checked
 from mpfjax.models.dynamics import Autoregression
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel, positive_deviations
-from mpfjax.vision.colour.bins import AbstractColours, HSVColours
+from mpfjax.vision.colour import HSVColours
 
-_MOMENTUM = 0.5
+_MOMENTUM, _BANDS = 0.5, 2
 PAPER_DEVIATIONS = (2.0, 2.0, 0.001, 0.001)
 
 
@@ -28,8 +26,6 @@ def joint_colour_model(
     boxes: Float[np.ndarray, "objects 4"],
     *,
     lambda_: Positive = 20.0,
-    num_parts: Count = 2,
-    colours: AbstractColours | None = None,
     deviations: Sequence[float] = PAPER_DEVIATIONS,
     templates: Mapping[int, tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "4"]]]
     | None = None,
@@ -41,18 +37,16 @@ def joint_colour_model(
 
         L(y | x^j) ∝ exp(-λ d²),  x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t
 
-    d² is the squared Bhattacharyya distance of HSV histograms, summed over the P bands into which a
-    box is divided from top to bottom, as in Pérez, Hue, Vermaak and Gangnet (2002), where λ is 20
-    as well. Each object has a `ColourModel`, which averages over bands, so that its σ² is 1 / (2 λ
-    P). The paper has one scale α; here width and height have separate scales. An observation is an
-    RGB frame for all objects. Its integral histogram is computed once in each step, and under
+    d² is the squared Bhattacharyya distance of `HSVColours` histograms, summed over the upper and
+    the lower half of a box, as in Pérez, Hue, Vermaak and Gangnet (2002), where λ is 20 as well.
+    Each object has a `ColourModel`, which averages over both, so that its σ² is 1 / (4 λ). The
+    paper has one scale α; here width and height have separate scales. An observation is an RGB
+    frame for all objects. Its integral histogram is computed once in each step, and under
     `monte_carlo` once for all runs.
 
     - `boxes`: (x, y, w, h), top-left corner first, the initial positions of the objects and of
       their templates in `frame`.
     - `lambda_`: λ.
-    - `num_parts`: bands.
-    - `colours`: the bins of the histograms; None is `HSVColours()`.
     - `deviations`: σ of x and y in pixels and of the scales of width and height; also those of x_0.
     - `templates`: (frame, box) for an object whose template is in another frame, by its index.
     - `interaction`: as in `MultiObjectModel`, between `BoxState`s.
@@ -63,13 +57,13 @@ def joint_colour_model(
     """
     boxes = to_rows(4, "boxes", boxes)
     # σ of exp(-(mean of d²) / 2σ²) for exp(-λ (sum of d²)).
-    sigma = float((2 * lambda_ * num_parts) ** -0.5)
+    sigma = float((2 * lambda_ * _BANDS) ** -0.5)
     steps = positive_deviations(deviations, 1).reshape(4)
     momentum = Autoregression.with_momentum(_MOMENTUM, jnp.asarray(steps, float))
 
     learn = partial(
-        ColourModel.from_frame, colours=HSVColours() if colours is None else colours, sigma=sigma,
-        deviations=steps, dynamics=momentum, num_parts=num_parts,
+        ColourModel.from_frame, colours=HSVColours(), sigma=sigma, deviations=steps,
+        dynamics=momentum, num_parts=_BANDS,
     )  # fmt: skip
     model = learn(frame, boxes)
     for j, (other_frame, box) in (templates or {}).items():

@@ -1,8 +1,6 @@
 """Boxes in the form of MOTChallenge files: (x, y) of the top-left corner, w, h."""
 
 import codecs
-import csv
-import io
 import json
 import re
 from pathlib import Path
@@ -10,10 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.arrays import (
-    to_rows,
-)
-from mpfjax.checks import shown, warn
+from mpfjax.arrays import to_rows
+from mpfjax.checks import shown
 
 _COMMENTS = ("#", "%", "//")
 # The names that a header may give to the columns, in lower case and without "_".
@@ -28,11 +24,11 @@ TRACK_FORM = "frame,id,x,y,w,h and one to four more columns, frames from 1 on"
 TRACK_COLUMNS = range(7, 11)
 
 
-def parse_box(text: str, argument: str = "box") -> Float[np.ndarray, "4"]:
-    """Read "x,y,w,h" in pixels. Raises `ValueError` naming `argument` for any other text."""
+def parse_box(text: str) -> Float[np.ndarray, "4"]:
+    """Read the option --box, "x,y,w,h" in pixels. Raises `ValueError` for any other text."""
     box = np.array([_number(part) for part in text.split(",")])
     if box.shape != (4,) or not np.all(np.isfinite(box)):
-        raise ValueError(f"{argument}: {text!r} is not four numbers x,y,w,h")
+        raise ValueError(f"--box: {text!r} is not four numbers x,y,w,h")
     return box
 
 
@@ -76,17 +72,10 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     separated by tabs, semicolons or blanks; comments, and a header that names these columns, are
     skipped. For a ground truth, in which flags and classes determine which rows count, use
     `read_truth`. Raises `ValueError` for a line that cannot be read, with the file and the line,
-    and for a file without any box. Warns if the seventh column is that of a ground truth in which
-    some rows do not count.
+    and for a file without any box.
     """
-    rows = list(read_rows(path, TRACK_FORM, TRACK_COLUMNS, least_id=0).values())
-    flags = [row[6] for row in rows]
-    if set(flags) == {0.0, 1.0}:
-        message = (
-            f"{path}: {flags.count(0.0)} rows are flagged 0, as a ground truth flags what does"
-        )
-        warn(f"{message} not count; read_truth leaves them out")
-    return np.array([row[:6] for row in rows])
+    rows = read_rows(path, TRACK_FORM, TRACK_COLUMNS, least_id=0)
+    return np.array([row[:6] for row in rows.values()])
 
 
 def read_detections(
@@ -152,11 +141,11 @@ def _with_score_and_class(rows: np.ndarray) -> np.ndarray:
 
 
 def _as_csv(rows: np.ndarray) -> str:
-    lines = csv.writer(file := io.StringIO(), lineterminator="\n")
-    lines.writerow(("frame", "id", "x", "y", "w", "h", "score", "class"))
+    lines = ["frame,id,x,y,w,h,score,class"]
     for frame, track, *numbers, kind in _with_score_and_class(rows).tolist():
-        lines.writerow((int(frame), int(track), *(f"{each:.7g}" for each in numbers), int(kind)))
-    return file.getvalue()
+        values = ",".join(f"{each:.7g}" for each in numbers)
+        lines.append(f"{int(frame)},{int(track)},{values},{int(kind)}")
+    return "\n".join([*lines, ""])
 
 
 def _as_coco(rows: np.ndarray) -> str:

@@ -2,6 +2,7 @@
 
 import contextlib
 import heapq
+import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator
@@ -17,7 +18,7 @@ from mpfjax.vision.files.sequences import read_sequence_info
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 # The folder of images in a sequence; MOTChallenge's is the second.
-_INNER = ("img", "img1")
+INNER = ("img", "img1")
 _RATE = 25.0  # frames a second of a video that does not say it
 _SOME = 20  # as many numbers are said
 # In half to .7 of the time of the preset "fast" at rate 20, with the same quality to .1 dB, in
@@ -59,18 +60,17 @@ def read_frames(
     return of_one_kind(_read_video(path, first, last, times), first, str(path))
 
 
-def parse_range(text: str | None, argument: str = "frames") -> tuple[int, int | None]:
-    """A and B of "A:B", frames counted from 1; without B it is None, for the last frame.
+def parse_range(text: str | None) -> tuple[int, int | None]:
+    """A and B of the option --frames "A:B", counted from 1; without B it is None, for the last.
 
-    Raises `ValueError` naming `argument` for any other text.
+    Raises `ValueError` for any other text.
     """
     if text is None:
         return 1, None
-    a, colon, b = text.partition(":")
-    whole = colon and a.isdecimal() and (b.isdecimal() or not b)
-    first, last = (int(a), int(b) if b else None) if whole else (0, None)
+    span = re.fullmatch(r"(\d+):(\d*)", text, re.ASCII)
+    first, last = (int(span[1]), int(span[2]) if span[2] else None) if span else (0, None)
     if first < 1 or (last is not None and last < first):
-        raise ValueError(f"{argument}: {text!r} is not A:B with 1 <= A <= B")
+        raise ValueError(f"--frames: {text!r} is not A:B with 1 <= A <= B")
     return first, last
 
 
@@ -117,24 +117,22 @@ def write_video(
     if Path(path).suffix.lower() != ".mp4":
         raise ValueError(f"path: {path} ends in neither .mp4 nor .gif")
     library, rate = optional("av", "av"), Fraction(frames_per_second).limit_denominator(1001)
-    file: Any = None
-    stream: Any = None
-
-    def finish() -> None:
-        file.mux(stream.encode())
-
-    with contextlib.ExitStack() as opened:
-        for still in stills:
-            # The pixel format of an MP4 needs an even height and width.
-            height, width, _ = still.shape
-            still = np.pad(still, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-            if stream is None:
-                file = opened.enter_context(library.open(_url(path), "w"))
-                stream = file.add_stream("libx264", rate=rate, options=_X264)
-                stream.height, stream.width, stream.pix_fmt = *still.shape[:2], "yuv420p"
-                stream.codec_context.thread_count = 0  # one for each processor
-                opened.callback(finish)
-            file.mux(stream.encode(library.VideoFrame.from_ndarray(still, format="rgb24")))
+    first = next(stills, None)
+    if first is None:
+        return
+    # The pixel format of an MP4 needs an even height and width.
+    height, width, _ = first.shape
+    margins = (0, height % 2), (0, width % 2), (0, 0)
+    with library.open(_url(path), "w") as file:
+        stream = file.add_stream("libx264", rate=rate, options=_X264)
+        stream.height, stream.width = height + height % 2, width + width % 2
+        stream.pix_fmt, stream.codec_context.thread_count = "yuv420p", 0  # one for each processor
+        try:
+            for still in itertools.chain([first], stills):
+                image = np.pad(still, margins, mode="edge")
+                file.mux(stream.encode(library.VideoFrame.from_ndarray(image, format="rgb24")))
+        finally:
+            file.mux(stream.encode())
 
 
 def check_frame(frame: Any, argument: str = "frame") -> None:
@@ -178,7 +176,7 @@ def without_gaps(frames: Iterable[Any]) -> Iterator[Any]:
 
 
 def _image_paths(folder: Path) -> list[Path]:
-    folder = next((folder / name for name in _INNER if (folder / name).is_dir()), folder)
+    folder = next((folder / name for name in INNER if (folder / name).is_dir()), folder)
     # Other systems leave hidden companions of the images behind.
     shown = [path for path in folder.iterdir() if not path.name.startswith(".")]
     return sorted((path for path in shown if path.suffix.lower() in _IMAGES), key=_natural)

@@ -94,9 +94,7 @@ def read_truth(path: str | Path, *, format: Format | None = None) -> Truth:
     boxes, counts, ignored = table[:, :6], table[:, _FLAG] != 0, np.zeros((0, 6))
     classes, numbers = table[:, _CLASS], _KNOWN.get(format)
     if numbers is not None and not np.isin(classes, numbers).all():
-        raise ValueError(
-            f"{path}: no class from {numbers[0]} to {numbers[-1]} in each eighth column"
-        )
+        raise ValueError(f"{path}: column 8 is no class from {numbers[0]} to {numbers[-1]}")
     if format == "motchallenge":
         kinds = _NOT_TO_BLAME | ({_VEHICLE} if name.startswith("mot20") else set())
         counts &= classes == _PEDESTRIAN
@@ -214,12 +212,6 @@ def read_sequence_info(*folders: Path) -> SequenceInfo:
 def detection_files(folder: Path) -> list[Path]:
     """The files of detections of a sequence: det*.txt in its folder, and in `det` there."""
     return sorted(folder.glob("det*.txt")) + sorted(folder.glob("det/det*.txt"))
-
-
-def sequence_of(detections: Path) -> Path | None:
-    """The folder of the sequence to which a file of detections belongs, by its path, or None."""
-    file = Path(detections).absolute()
-    return next((folder for folder in file.parents[:2] if file in detection_files(folder)), None)
 
 
 def last_frame(info: SequenceInfo, *rows: np.ndarray) -> int:

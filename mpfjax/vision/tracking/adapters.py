@@ -9,9 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.arrays import (
-    to_rows,
-)
+from mpfjax.arrays import to_rows
 from mpfjax.checks import CountOrZero, checked, is_series, saying, shown, warn
 from mpfjax.vision.files.boxes import read_detections
 from mpfjax.vision.tracking.detections import Detections
@@ -48,26 +46,20 @@ class Rows:
         rows = to_rows(rows.shape[1], "detections", rows)
         bad = ~np.isfinite(rows[:, 0]) | (rows[:, 0] % 1 != 0) | (rows[:, 0] < 1)
         for number in np.flatnonzero(bad)[:1]:
-            row = shown(rows[number])
-            raise ValueError(f"detections: row {number}, {row}, is of no frame; they count from 1")
-        # Which row each is, in the order of the frames.
-        self.places = np.argsort(rows[:, 0], kind="stable")
-        self._rows = rows[self.places]
+            named = f"detections: row {number}, {shown(rows[number])},"
+            raise ValueError(f"{named} is of no frame; they count from 1")
+        self._rows = rows[np.argsort(rows[:, 0], kind="stable")]
         self.frames = self._rows[:, 0].astype(int)
         self.is_limited = last is not None
         self.last = int(self.frames.max(initial=0)) if last is None else last
 
-    def of_frame(self, number: int) -> Detections:
+    def get(self, number: int) -> Detections:
         """The detections of a frame."""
         begin, end = np.searchsorted(self.frames, [number, number + 1])
         rows = self._rows[begin:end]
         at, width = self._score, rows.shape[1]
         of_kind = rows[:, at + 1] if width == at + 2 else None
         return Detections(rows[:, 2:at], rows[:, at] if width > at else None, of_kind)
-
-    def num_after(self, last: int) -> int:
-        """How many rows lie in later frames."""
-        return int(np.sum(self.frames > last))
 
     def most_objects(self) -> int:
         """One and a half times the number of detections in all but the fullest frames."""
@@ -79,7 +71,7 @@ class Rows:
 Detector = Rows | Callable[[Any], Any] | Mapping[int, Any] | Iterable[Any]
 
 
-def as_detector(detections: Any, coordinates: int = 4) -> Detector:
+def as_detector(detections: Any, coordinates: int) -> Detector:
     """Files and arrays as rows; a callable, a mapping and an iterable as they are.
 
     Raises `ValueError` for anything else, and for rows that are not in MOTChallenge's form.
@@ -94,6 +86,13 @@ def as_detector(detections: Any, coordinates: int = 4) -> Detector:
     raise ValueError(f"detections: {shown(detections)} is no detector, rows, file or boxes a frame")
 
 
+def _frames_of(detector: Detector) -> np.ndarray | None:
+    """The frames of detections that have numbers, in order; None for other detections."""
+    if isinstance(detector, Rows):
+        return detector.frames
+    return np.array(sorted(detector), int) if isinstance(detector, Mapping) else None
+
+
 def first_step(detector: Detector, first: int | None, frames_per_second: float) -> int:
     """The number of the first frame where there are no pixels: that of the first row, if not given.
 
@@ -101,41 +100,41 @@ def first_step(detector: Detector, first: int | None, frames_per_second: float) 
     of nothing. Raises `ValueError` for a row that comes more than a minute after the one before it,
     unless the last frame is given.
     """
-    if not isinstance(detector, Rows | Mapping):
+    frames = _frames_of(detector)
+    if frames is None or not len(frames):
         return first or 1
-    is_rows = isinstance(detector, Rows)
-    frames = detector.frames if is_rows else np.array(sorted(detector), int)
-    first = first or int(frames[0] if len(frames) else 1)
-    most, gaps = int(60 * frames_per_second), np.diff(frames, prepend=first)
-    late = [] if is_rows and detector.is_limited else np.flatnonzero(gaps > most)
-    for at in late[:1]:
-        row = f"row {detector.places[at]}, of " if is_rows else ""
-        before = "what is before it" if at else f"frame {first}, the first"
+    first, most = first or int(frames[0]), int(60 * frames_per_second)
+    before = np.append(first, frames[:-1])
+    late = np.flatnonzero(frames - before > most)
+    if len(late) and not (isinstance(detector, Rows) and detector.is_limited):
+        at = late[0]
         raise ValueError(
-            f"detections: {row}frame {frames[at]}, comes {gaps[at]} frames after {before}, and a"
-            f" minute has {most}; number the frames one by one, and track apart what is far apart"
+            f"detections: frame {frames[at]} comes {frames[at] - before[at]} frames after frame"
+            f" {before[at]}, and a minute has {most}; number the frames one by one, and track apart"
+            " what is far apart"
         )
     return first
 
 
 def observe(
-    stills: Iterator[np.ndarray | None] | None, detector: Detector, first: int, coordinates: int = 4
-) -> Iterator[tuple[int, np.ndarray | None, Detections | None]]:
+    stills: Iterator[np.ndarray | None] | None, detector: Detector, first: int
+) -> Iterator[tuple[int, np.ndarray | None, Any]]:
     """Number, pixels and detections of each frame; None where no detector ran.
 
     Warns of detections after the last frame.
     """
-    numbers, coming, number = itertools.count(first), iter(()), first - 1
-    if isinstance(detector, Rows | Mapping):
-        last = detector.last if isinstance(detector, Rows) else max(detector, default=0)
-        numbers = range(first, last + 1)
-    elif not callable(detector):
-        coming = iter(detector)
+    frames, number = _frames_of(detector), first - 1
+    coming = iter(()) if frames is not None or callable(detector) else iter(detector)
+    if stills is not None:
+        steps = enumerate(stills, first)
+    elif frames is None:
+        steps = zip(itertools.count(first), itertools.repeat(None))
+    else:
+        last = detector.last if isinstance(detector, Rows) else frames.max(initial=0)
+        steps = zip(range(first, last + 1), itertools.repeat(None))
 
     def detect(number: int, still: np.ndarray | None) -> Any:
-        if isinstance(detector, Rows):
-            return detector.of_frame(number)
-        if isinstance(detector, Mapping):
+        if isinstance(detector, Rows | Mapping):
             return detector.get(number)
         if not callable(detector):
             return next(coming, _END)
@@ -144,16 +143,14 @@ def observe(
         with saying(f"detections: raised by the detector at frame {number}"):
             return detector(still)
 
-    frames = zip(numbers, itertools.repeat(None)) if stills is None else enumerate(stills, first)
-    for number, still in frames:
+    for number, still in steps:
         output = detect(number, still)
         if output is _END and still is None:
             return
         if output is _END:
             raise ValueError(f"detections: end before the frames do, at frame {number}")
-        named = f"detections: frame {number}"
-        yield number, still, None if output is None else Detections.of(output, named, coordinates)
-    if isinstance(detector, Rows) and (late := detector.num_after(number)):
+        yield number, still, output
+    if frames is not None and (late := np.sum(frames > number)):
         warn(f"detections: {late} lie in frames after the last, {number}, and were left out")
-    if next(coming, _END) is not _END or (isinstance(detector, Mapping) and number < last):
+    if next(coming, _END) is not _END:
         warn(f"detections: go on after the last frame, {number}, and were left out")

@@ -1,5 +1,7 @@
 """Data association: costs of pairs, their joint probabilities, and who has which detection."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
@@ -7,14 +9,20 @@ from scipy.special import expit
 
 from mpfjax.moves.objects.association import iterate_replies
 from mpfjax.vision.tracking.gaussian import Gaussian
-from mpfjax.vision.tracking.pairs import Pairs, intervals
+from mpfjax.vision.tracking.pairs import Flags, Integers, Pairs, intervals
+from mpfjax.vision.tracking.scores import KEPT, PRIOR
 
 _FREEDOM = 4.0  # degrees, of Student's distribution of gaps
 _COLOUR_COST, _UNDECIDED = 14.0, 0.25  # of B², and where it is evidence neither for nor against
 _ADAPTATION = 0.14  # the share of a frame in an object's colours
 _LEAST = 1e-30  # a row without a pair weighs at least this beside its best pair
 _WIDEST = -0.5  # log |S| counts as at most this: a detection at the prediction forms a pair
-TEMPERATURE = 2.0  # above 1 it allows for cues that are not independent
+_MOST_UNLIKE = 8.0  # at most the cost of vectors: some are of something else than their box
+_LEAST_VARIANCE = 1e-3  # of distances between vectors
+_MARGIN = 6.0  # around all points, in deviations of their errors
+# Of m objects and d detections: rows of m, rows of d, and values of pairs.
+Table, Places = Float[np.ndarray, "m bins"], Float[np.ndarray, "d k"]
+Costs = Float[np.ndarray, "m d"]
 
 
 def compatible(
@@ -24,9 +32,7 @@ def compatible(
     return (a == b) | (a == 0) | (b == 0)
 
 
-def unlikeness(
-    descriptors: Float[np.ndarray, "d bins"], references: Float[np.ndarray, "m bins"]
-) -> Float[np.ndarray, "m d"]:
+def unlikeness(descriptors: Float[np.ndarray, "d bins"], references: Table) -> Costs:
     """The cost of colours: that of B² = 1/4 is 0, as it is where there are none.
 
     B² is the squared Bhattacharyya distance of histograms, the mean over the bands of a box.
@@ -37,11 +43,7 @@ def unlikeness(
     return np.where(np.any(references, axis=1, keepdims=True), cost, 0.0)
 
 
-def learned_descriptors(
-    references: Float[np.ndarray, "m bins"],
-    descriptors: Float[np.ndarray, "m bins"],
-    alone: Bool[np.ndarray, " m"],
-) -> Float[np.ndarray, "m bins"]:
+def learned_descriptors(references: Table, descriptors: Table, alone: Flags) -> Table:
     """The histograms, or vectors, after those of the detections, 0 where there is none.
 
     The first one counts whole; later ones do where the object is `alone`: objects in contact would
@@ -52,12 +54,78 @@ def learned_descriptors(
     return (1 - rate) * references + rate * descriptors
 
 
+class Likeness(NamedTuple):
+    """Cosine distances of objects' vectors to those of their detections, and of others.
+
+    - `number`, `total`, `squares`: (2,), how many there were, their sum, and that of their squares;
+      to the same object's first. Without any, vectors tell nothing.
+    """
+
+    number: Float[np.ndarray, "2"] = np.zeros(2)
+    total: Float[np.ndarray, "2"] = np.zeros(2)
+    squares: Float[np.ndarray, "2"] = np.zeros(2)
+
+    def cost(self, distances: Costs) -> Costs:
+        """-2 log of the odds that a pair at this distance is of the same object, beside motion.
+
+        Distances of both kinds are normal with the same variance, so that the logarithm is linear,
+        and weighs the more the further their means are apart (Fisher's discriminant). It counts as
+        n / (n + 5) of it after n pairs, 0 where the distance is not known, and at most 8.
+        """
+        number = np.maximum(self.number, 1.0)
+        means = self.total / number
+        variance = np.mean(np.maximum(self.squares / number - means**2, 0.0)) + _LEAST_VARIANCE
+        information = self.number.min() / (self.number.min() + PRIOR)
+        slope = information * max(means[1] - means[0], 0.0) / variance
+        cost = np.clip(2 * slope * (distances - means.mean()), -_MOST_UNLIKE, _MOST_UNLIKE)
+        return np.where(np.isfinite(distances), cost, 0.0)
+
+    def after(self, distances: Costs, same: Bool[np.ndarray, "m d"]) -> "Likeness":
+        """With a frame's distances, of objects that have a detection: `same` says which."""
+        had = np.any(same, axis=1, keepdims=True) & np.isfinite(distances)
+        kinds = [distances[had & which] for which in (same, ~same)]
+        sums = np.array([(len(kind), kind.sum(), (kind**2).sum()) for kind in kinds]).T
+        return Likeness(*(KEPT * old + new for old, new in zip(self, sums, strict=True)))
+
+
+def cosine_distances(
+    references: Float[np.ndarray, "m e"], descriptors: Float[np.ndarray, "d e"]
+) -> Float[np.ndarray, "m d"]:
+    """1 - cos of the angle of vectors; NaN where one of them is zero, as where none is known."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        references, descriptors = (
+            each / np.linalg.norm(each, axis=1, keepdims=True) for each in (references, descriptors)
+        )
+    return 1 - references @ descriptors.T
+
+
+class Clutter(NamedTuple):
+    """Points without an object, and the area that they come from, in deviations of their errors.
+
+    - `corners`: (2, 2), the lowest and the highest of all points so far; none before any.
+    - `number`: of points of nobody, in so many `frames`; one in one frame before any.
+    """
+
+    corners: Float[np.ndarray, "c 2"] = np.zeros((0, 2))
+    number: float = 1.0
+    frames: float = 1.0
+
+    def after(self, places: Float[np.ndarray, "d k"], number: int) -> "Clutter":
+        """With a frame's detections, so many of them of nobody."""
+        corners = np.concatenate([self.corners, places[:, :2]])
+        if len(corners):
+            corners = np.array([corners.min(axis=0), corners.max(axis=0)])
+        return Clutter(corners, KEPT * self.number + number, KEPT * self.frames + 1)
+
+    @property
+    def cost(self) -> float:
+        """2 log(2π λ), λ the density: what takes a pair's cost to that of a point of nobody."""
+        sides = np.sum(np.diff(self.corners, axis=0), axis=0) + 2 * _MARGIN
+        return 2 * float(np.log(2 * np.pi * self.number / self.frames / np.prod(sides)))
+
+
 def mahalanobis(
-    predicted: Gaussian,
-    errors: Float[np.ndarray, " k"],
-    places: Float[np.ndarray, "d k"],
-    beside: Float[np.ndarray, "m d"],
-    others: float = 0.0,
+    predicted: Gaussian, errors: np.ndarray, places: Places, beside: Costs, others: float = 0.0
 ) -> Pairs:
     """-2 log p of each detection under each prediction, up to a constant, with lengths in boxes.
 
@@ -82,7 +150,7 @@ def mahalanobis(
     return Pairs(rows, columns, values, (len(place), len(places)))
 
 
-def marginals(log_odds: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
+def marginals(log_odds: Costs) -> Costs:
     """The probability of each pair, where each row and each column is in at most one pair.
 
     An assignment has the weight Π exp(log_odds) over its pairs; a row or column without a pair
@@ -94,8 +162,11 @@ def marginals(log_odds: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
     return weighed / (missed + np.sum(weighed, axis=1))[:, None]
 
 
-def probabilities(cost: Pairs, temperature: float = TEMPERATURE) -> Float[np.ndarray, " p"]:
-    """The marginals of pairs by their costs, -2 log p; a row without a pair costs nothing."""
+def probabilities(cost: Pairs, temperature: float) -> Float[np.ndarray, " p"]:
+    """The marginals of pairs by their costs, -2 log p; a row without a pair costs nothing.
+
+    A `temperature` above 1 allows for cues that are not independent.
+    """
     log_odds = -cost.values / (2 * temperature)
     probability = expit(log_odds)
     rivals = cost.rivals
@@ -104,7 +175,7 @@ def probabilities(cost: Pairs, temperature: float = TEMPERATURE) -> Float[np.nda
     return probability
 
 
-def one_to_one(cost: Pairs) -> Int[np.ndarray, " m"]:
+def one_to_one(cost: Pairs) -> Integers:
     """A column for each row at the least total cost; -1 for none, at cost 0."""
     # A pair that costs more than none is as good as none, and one without rivals is chosen.
     cost = cost.at(cost.values < 0)

@@ -5,22 +5,50 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from mpfjax.arrays import (
-    to_numbers,
-    to_rows,
-)
+from mpfjax.arrays import to_numbers, to_rows
 from mpfjax.checks import shown, warn
 from mpfjax.vision.files.boxes import to_centre
-from mpfjax.vision.tracking.gaussian import places_of
-from mpfjax.vision.tracking.kinds import BOXES, Kind
 
 # Why a detection cannot be tracked, in the order in which it is asked.
-FAULTS: tuple[str, ...] = ("not finite", "of no area", "outside the frame")
-
+_FAULTS = ("not finite", "of no area", "outside the frame")
 # So many boxes tell whether they are x, y, w, h: by a tenth of the frame beyond it, or within 1.5.
 _ENOUGH, _BEYOND, _SHARES = 20, 1.1, 1.5
 _FORM = "they are taken for x, y, w, h in pixels, with (x, y) the top-left corner"
-_UNBOUNDED = (-np.inf, -np.inf, np.inf, np.inf)
+
+
+class Kind(NamedTuple):
+    """All in which tracking boxes differs from tracking points.
+
+    - `coordinates`: of a detection, (x, y, w, h) or (x, y).
+    - `unit`: in pixels, the length in which places are given; 1 of boxes, which have sizes.
+    - `temperature`: of the association; 1 where distance is the only cue.
+    - `odds`: of an object at its first detection to those that confirm it, in logarithms; 0 of
+      boxes, which two strong detections confirm.
+    - `missed`: the log-probability that an object has no detection, in these odds.
+    """
+
+    coordinates: int
+    unit: float
+    temperature: float
+    odds: float
+    missed: float
+
+    @property
+    def has_boxes(self) -> bool:
+        """Whether detections have sizes, and so colours, and overlaps that tell cameras' motion."""
+        return self.coordinates == 4
+
+
+BOXES = Kind(4, 1.0, 2.0, 0.0, 0.0)
+
+
+def kind_of_points(deviation: float) -> Kind:
+    """Points with an error of this standard deviation.
+
+    Before any point an object has odds of 1 to 10, and odds of 20 to 1 confirm it; one of its
+    points in seven is missed.
+    """
+    return Kind(2, float(deviation), 1.0, -np.log(10) - np.log(20), -np.log(7))
 
 
 class Detections(NamedTuple):
@@ -39,36 +67,38 @@ class Detections(NamedTuple):
     vectors: Float[np.ndarray, "k e"] | None = None
 
     @classmethod
-    def of(cls, output: Any, named: str, coordinates: int = 4) -> "Detections":
+    def of(cls, output: Any, named: str, coordinates: int) -> "Detections":
         """The detections from a user's boxes, or points, or a tuple (boxes, scores, classes).
 
         Raises `ValueError` for boxes that are not rows of four numbers, or points of two, for
         scores and classes that are not one number per box, for classes that are not integers from 0
         on, and for vectors that are not one finite row per box.
         """
-        several = isinstance(output, tuple) and len(output) in (2, 3)
-        parts: tuple[Any, ...] = output if several or isinstance(output, cls) else (output,)
-        rows = to_rows(coordinates, named, parts[0])
-        rest: list[Any] = []
-        for each, values in zip(cls._fields[1:3], parts[1:], strict=False):
-            if values is not None:
-                values = np.array(to_numbers(f"{named}: {each}")(values))
-                if len(values) != len(rows):
-                    raise ValueError(f"{named}: {len(values)} {each} for {len(rows)} boxes")
-            rest.append(values)
-        detections = cls(rows, *rest)
-        if isinstance(output, cls) and output.vectors is not None:
-            vectors = np.asarray(output.vectors, float)
+        if not isinstance(output, cls):
+            several = isinstance(output, tuple) and len(output) in (2, 3)
+            output = cls(*output) if several else cls(output)
+        rows, (scores, classes, vectors) = to_rows(coordinates, named, output.boxes), output[1:]
+        if scores is not None:
+            scores = _one_each(named, "scores", scores, len(rows))
+        if classes is not None:
+            classes = _one_each(named, "classes", classes, len(rows))
+            if (classes % 1 != 0).any() or (classes < 0).any():
+                raise ValueError(f"{named}: classes {shown(classes)} are no whole numbers from 0")
+            classes = classes.astype(int)
+        if vectors is not None:
+            vectors = np.asarray(vectors, float)
             if vectors.ndim != 2 or len(vectors) != len(rows) or not np.isfinite(vectors).all():
                 expected = f"{len(rows)} rows of finite numbers"
                 raise ValueError(f"{named}: vectors of shape {vectors.shape} are not {expected}")
-            detections = detections._replace(vectors=vectors)
-        if detections.classes is None:
-            return detections
-        if (detections.classes % 1 != 0).any() or (detections.classes < 0).any():
-            what = shown(detections.classes)
-            raise ValueError(f"{named}: classes {what} are no whole numbers from 0")
-        return detections._replace(classes=detections.classes.astype(int))
+        return cls(rows, scores, classes, vectors)
+
+
+def _one_each(named: str, what: str, values: Any, number: int) -> np.ndarray:
+    """The scores, or classes, as numbers, one for each box."""
+    numbers = np.array(to_numbers(f"{named}: {what}")(values))
+    if len(numbers) != number:
+        raise ValueError(f"{named}: {len(numbers)} {what} for {number} boxes")
+    return numbers
 
 
 class FrameDetections(NamedTuple):
@@ -78,7 +108,7 @@ class FrameDetections(NamedTuple):
     - `scores`, `classes`: (d,), a class of 0 for none.
     - `rows`: (d,), the row of each in what the detector gave.
     - `extent`: left, top, right, bottom of the frame; infinite where not known.
-    - `left_out`: (3,), how many cannot be tracked, by `FAULTS`; `warnings`: the first of each.
+    - `warning`: of the first that cannot be tracked, empty where all can.
     - `colours`: (d, bins), None without pixels; `vectors`: (d, e), None where nobody gave them.
     """
 
@@ -87,59 +117,55 @@ class FrameDetections(NamedTuple):
     classes: Int[np.ndarray, " d"]
     rows: Int[np.ndarray, " d"]
     extent: Float[np.ndarray, "4"]
-    left_out: Int[np.ndarray, "3"]
-    warnings: tuple[str, ...]
-    colours: Float[np.ndarray, "d bins"] | None = None
-    vectors: Float[np.ndarray, "d e"] | None = None
+    warning: str
+    colours: Float[np.ndarray, "d bins"] | None
+    vectors: Float[np.ndarray, "d e"] | None
 
     @classmethod
     def of(
         cls,
-        detections: Detections,
-        named: str,
+        output: Any,
+        number: int,
         frame_size: tuple[int, int] | None,
-        kind: Kind = BOXES,
+        kind: Kind,
+        min_score: float | None = None,
     ) -> "FrameDetections":
-        """Leave out what cannot be tracked, and count it."""
-        rows, scores, classes, vectors = detections
-        boxes = np.asarray(rows, float)
-        scores = np.ones(len(rows)) if scores is None else scores
-        keep = np.ones(len(rows), bool)
-        extent = np.array(_UNBOUNDED)
+        """From the output of a detector for frame `number`, without scores below the least.
+
+        Raises `ValueError` for a least score where there are none, and as `Detections.of` does.
+        """
+        named = f"detections: frame {number}"
+        boxes, scores, classes, vectors = Detections.of(output, named, kind.coordinates)
+        if scores is None and min_score is not None and len(boxes):
+            raise ValueError(f"min_score: {min_score}, and detections have no scores")
+        scores = np.ones(len(boxes)) if scores is None else scores
+        classes = np.zeros(len(boxes), int) if classes is None else classes
+        extent = np.array([-np.inf, -np.inf, np.inf, np.inf])
         if frame_size is not None:
             extent = np.array([0, 0, frame_size[1], frame_size[0]], float)
         with np.errstate(invalid="ignore"):
             far = boxes[:, :2] + (boxes[:, 2:] if kind.has_boxes else 0.0)
-            sound = (
+            sound = np.stack([
                 np.isfinite(boxes).all(axis=1) & np.isfinite(scores),
                 (boxes[:, 2:] > 0).all(axis=1),
                 ((far > extent[:2]) & (boxes[:, :2] < extent[2:])).all(axis=1),
-            )
-        left_out, warnings = np.zeros(len(FAULTS), int), []
-        for i, (good, fault) in enumerate(zip(sound, FAULTS, strict=True)):
-            wrong = np.flatnonzero(keep & ~good)
-            left_out[i], keep = len(wrong), keep & good
-            first = f"row {wrong[0]}, {shown(boxes[wrong[0]].tolist())}, is" if len(wrong) else ""
-            warnings.append(f"{named}, {first} {fault}; left out, as all such are")
-        rows = np.flatnonzero(keep)
+            ])  # fmt: skip
+        keep, warning = sound.all(axis=0), ""
+        for row in np.flatnonzero(~keep)[:1]:
+            what = f"{shown(boxes[row].tolist())}, is {_FAULTS[np.argmin(sound[:, row])]}"
+            warning = f"{named}, row {row}, {what}; left out, as all such are"
+        rows = np.flatnonzero(keep & (scores >= (-np.inf if min_score is None else min_score)))
         areas = np.prod(boxes[rows, 2:], axis=1)
         rows = rows[np.lexsort((rows, -areas, -scores[rows]))]
-        classes = np.zeros(len(scores), int) if classes is None else classes
         boxes = to_centre(boxes[rows]) if kind.has_boxes else boxes[rows] / kind.unit
-        about, extent = (scores[rows], classes[rows], rows), extent / kind.unit
         vectors = None if vectors is None else vectors[rows]
-        return cls(boxes, *about, extent, left_out, tuple(warnings), vectors=vectors)
+        about = scores[rows], classes[rows], rows, extent / kind.unit, warning
+        return cls(boxes, *about, colours=None, vectors=vectors)
 
-    def at(self, rows: np.ndarray | slice) -> "FrameDetections":
-        """Some of them."""
+    def strongest(self, most: int) -> "FrameDetections":
+        """The first so many."""
         names = ["boxes", "scores", "classes", "rows", *["vectors"] * (self.vectors is not None)]
-        return self._replace(**{name: getattr(self, name)[rows] for name in names})
-
-    def warn_of_first(self, before: Int[np.ndarray, "3"]) -> None:
-        """Warn of each fault that comes for the first time: so many came before."""
-        for warning, had, has in zip(self.warnings, before, self.left_out, strict=True):
-            if has and not had:
-                warn(warning)
+        return self._replace(**{name: getattr(self, name)[:most] for name in names})
 
     def form_counts(self, before: Int[np.ndarray, "3"]) -> Int[np.ndarray, "3"]:
         """How many boxes there were, how many far beyond the frame, and how many within [0, 1.5].
@@ -160,8 +186,3 @@ class FrameDetections(NamedTuple):
         if number >= _ENOUGH and num_small == number:
             warn(f"detections: all of {number} boxes lie within [0, {_SHARES}]; {_FORM}")
         return counts
-
-    @property
-    def places(self) -> Float[np.ndarray, "d k"]:
-        """(x, y, log w, log h), or (x, y)."""
-        return places_of(self.boxes)

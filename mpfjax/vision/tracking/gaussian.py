@@ -14,6 +14,8 @@ from mpfjax.vision.tracking.pairs import Pairs, intervals
 # The share of a size's growth rate that is left after a frame.
 _GROWTH_KEPT = 0.9
 _FURTHER = np.log(20)  # a distance beyond which one in twenty is, as -log of its probability
+# A number for each object and coordinate, or fewer that broadcast to these.
+Numbers = Float[np.ndarray, "*#n #k"]
 
 
 class Gaussian(NamedTuple):
@@ -35,12 +37,7 @@ class Gaussian(NamedTuple):
         return cls(*(np.zeros((0, *shape)) for _ in cls._fields))
 
     @classmethod
-    def initial(
-        cls,
-        place: Float[np.ndarray, "*#n #k"],
-        error: Float[np.ndarray, "*#n #k"],
-        speed: Float[np.ndarray, "*#n #k"],
-    ) -> "Gaussian":
+    def initial(cls, place: Numbers, error: Numbers, speed: Numbers) -> "Gaussian":
         """At a first detection: the deviation of its error, and that of a velocity of mean zero."""
         still = 0.0 * error * speed
         return cls(place + still, still, error**2 + still, still, speed**2 + still)
@@ -51,11 +48,7 @@ class Gaussian(NamedTuple):
         return units(self.place)
 
     def predict(
-        self,
-        place_noise: Float[np.ndarray, "*#n #k"],
-        velocity_noise: Float[np.ndarray, "*#n #k"],
-        unit: Float[np.ndarray, "*#n #k"],
-        frames: float = 1.0,
+        self, place_noise: Numbers, velocity_noise: Numbers, unit: Numbers, frames: float
     ) -> "Gaussian":
         """The moments so many frames later; growth rates of sizes decay, in the mean.
 
@@ -74,7 +67,7 @@ class Gaussian(NamedTuple):
         )
 
     def update(
-        self, detected: Float[np.ndarray, "*#n #k"], errors: Float[np.ndarray, "*#n #k"]
+        self, detected: Numbers, errors: Numbers
     ) -> tuple["Gaussian", Float[np.ndarray, "*n k"], Float[np.ndarray, "*n k"]]:
         """Kalman's update by a detection: the posterior, the innovations and their variances."""
         variance = self.var_place + errors**2
@@ -128,34 +121,25 @@ class CameraMotion(NamedTuple):
     A point (x, y) is now at (a x - b y, b x + a y) + shift, in pixels.
 
     - `turn`: (a, b), the cosine and sine of the angle, times the scale; `shift`: in pixels.
-    - `known`: whether it was estimated; if not, the others mean nothing.
     """
 
     turn: Float[np.ndarray, "2"]
     shift: Float[np.ndarray, "2"]
-    known: Bool[np.ndarray, ""] | bool
-
-    @classmethod
-    def unknown(cls) -> "CameraMotion":
-        """An unknown motion."""
-        return cls(np.array([1.0, 0.0]), np.zeros(2), False)
 
     moved = Renamed("moved", "move")
     carried = Renamed("carried", "carry")
 
     def move(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """The new positions of static points; unchanged if the motion is unknown."""
-        (a, b), shift = self.turn, self.shift
-        return points @ np.array([[a, b], [-b, a]]) + shift if self.known else points
+        """The new positions of static points."""
+        a, b = self.turn
+        return points @ np.array([[a, b], [-b, a]]) + self.shift
 
     def carry(self, moments: Gaussian) -> Gaussian:
-        """The moments of what moves with the image; unchanged if the motion is unknown.
+        """The moments of what moves with the image.
 
         Means of positions and velocities are rotated, sizes grow by the scale. Covariances along x
         and y are those of the rotated ones without the coupling of the two.
         """
-        if not self.known:
-            return moments
         a, b = np.asarray(self.turn, float).tolist()
         growth = 0.5 * np.log(a**2 + b**2)
 
@@ -192,10 +176,7 @@ def units(places: Float[np.ndarray, "*m k"]) -> Float[np.ndarray, "*m k"]:
 
 
 def overlapping(
-    a: Float[np.ndarray, "m k"],
-    b: Float[np.ndarray, "d k"],
-    least: float = 0.0,
-    variance: float = 2.0,
+    a: Float[np.ndarray, "m k"], b: Float[np.ndarray, "d k"], least: float, variance: float = 2.0
 ) -> Pairs:
     """The pairs of boxes, or of points, that share more than `least`, and what they share."""
     if a.shape[-1] == 2:
@@ -211,9 +192,7 @@ def overlapping(
     return pairs.at(pairs.values > least)
 
 
-def shared(
-    a: Float[np.ndarray, "*#n k"], b: Float[np.ndarray, "*#n k"], variance: float = 2.0
-) -> np.ndarray:
+def shared(a: Numbers, b: Numbers, variance: float = 2.0) -> np.ndarray:
     """Intersection over union of boxes by centre and size, pair by pair.
 
     Of points it is told by their distance alone, whose variance along x and y is that of two errors
@@ -239,8 +218,8 @@ def within(
     centred: Bool[np.ndarray, " k"] | bool = False,
 ) -> Bool[np.ndarray, " k"]:
     """Whether any part of each box, or its centre, is inside left, top, right and bottom."""
-    half = (
-        np.where(np.reshape(centred, (-1, 1)), 0.0, boxes[:, 2:] / 2) if boxes.shape[1] > 2 else 0
-    )
+    half = np.zeros(2)
+    if boxes.shape[1] > 2:
+        half = np.where(np.reshape(centred, (-1, 1)), 0.0, boxes[:, 2:] / 2)
     low, high = boxes[:, :2] - half, boxes[:, :2] + half
     return np.all((high >= extent[:2]) & (low <= extent[2:]), axis=1)

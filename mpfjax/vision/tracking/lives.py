@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.special import expit
 
-from mpfjax.vision.tracking.pairs import Pairs
+from mpfjax.vision.tracking.pairs import Flags, Integers, Numbers, Pairs
 from mpfjax.vision.tracking.scores import KEPT, PRIOR, rising
 
 _CONFIRMED = 2  # frames with strong detections after which there is an object
@@ -33,7 +33,7 @@ class Spans(NamedTuple):
     binned: float
 
     @classmethod
-    def at(cls, frames_per_second: float, lost_seconds: float | None = None) -> "Spans":
+    def at(cls, frames_per_second: float, lost_seconds: float | None) -> "Spans":
         """The seconds given, by default one, but eight frames; two, a tenth and three tenths.
 
         A bin has a frame at least.
@@ -56,23 +56,19 @@ class Lives(NamedTuple):
       boxes.
     """
 
-    identities: Int[np.ndarray, " m"]
-    classes: Int[np.ndarray, " m"]
-    scores: Float[np.ndarray, " m"]
-    num_strong: Int[np.ndarray, " m"]
-    unseen: Float[np.ndarray, " m"]
-    unsure: Float[np.ndarray, " m"]
-    confirmed: Bool[np.ndarray, " m"]
-    shown: Bool[np.ndarray, " m"]
-    odds: Float[np.ndarray, " m"]
+    identities: Integers
+    classes: Integers
+    scores: Numbers
+    num_strong: Integers
+    unseen: Numbers
+    unsure: Numbers
+    confirmed: Flags
+    shown: Flags
+    odds: Numbers
 
     @classmethod
     def initial(
-        cls,
-        identities: Int[np.ndarray, " k"],
-        classes: Int[np.ndarray, " k"],
-        at_once: Bool[np.ndarray, " k"],
-        odds: float = 0.0,
+        cls, identities: Integers, classes: Integers, at_once: Flags, odds: float
     ) -> "Lives":
         """The lives of new objects; `at_once`: which are confirmed, and shown, from the first."""
         one, sure = np.ones_like(identities), at_once
@@ -87,28 +83,9 @@ class Lives(NamedTuple):
         """The lives of these objects, followed by the others."""
         return Lives(*map(np.concatenate, zip(self, other, strict=True)))
 
-    def describe(
-        self,
-        detected: Bool[np.ndarray, " m"],
-        classes: Int[np.ndarray, " m"],
-        scores: Float[np.ndarray, " m"],
-    ) -> "Lives":
-        """With the scores of the detections, and the classes for those who have none as yet."""
-        return self._replace(
-            classes=np.where(self.classes > 0, self.classes, classes),
-            scores=np.where(detected, scores, self.scores),
-        )
-
     def advance(
-        self,
-        detected: Bool[np.ndarray, " m"],
-        strong: Bool[np.ndarray, " m"],
-        frames: float,
-        spans: Spans,
-        coast: float,
-        full: bool,
-        gained: Float[np.ndarray, " m"] | float = 0.0,
-    ) -> tuple["Lives", Bool[np.ndarray, " m"]]:
+        self, detected: Flags, strong: Flags, frames: float, spans: Spans, coast: float, full: bool
+    ) -> tuple["Lives", Flags]:
         """The lives after a frame's detections, so many frames after those before; who lives on.
 
         An object ends if it has had no detection for longer than the patience, or for more than one
@@ -121,10 +98,9 @@ class Lives(NamedTuple):
         num_strong = self.num_strong + strong
         unseen = np.where(detected, 0.0, self.unseen + frames)
         unsure = np.where(strong, 0.0, self.unsure + frames)
-        odds = self.odds + gained
-        confirmed = self.confirmed | ((num_strong >= _CONFIRMED) & (odds >= 0))
+        confirmed = self.confirmed | ((num_strong >= _CONFIRMED) & (self.odds >= 0))
         recent = confirmed & (unseen <= coast) & (unsure <= spans.unsure)
-        lives = self._replace(num_strong=num_strong, unseen=unseen, unsure=unsure, odds=odds)
+        lives = self._replace(num_strong=num_strong, unseen=unseen, unsure=unsure)
         lives = lives._replace(confirmed=confirmed, shown=recent)
         in_the_way = full & (num_strong < _CONFIRMED)
         tentative = 0 if full else _TENTATIVE * frames
@@ -138,13 +114,7 @@ class Coasting(NamedTuple):
     right: Float[np.ndarray, " bins"] = np.zeros(_BINS)
     wrong: Float[np.ndarray, " bins"] = np.zeros(_BINS)
 
-    def after(
-        self,
-        unseen: Float[np.ndarray, " m"],
-        right: Bool[np.ndarray, " m"],
-        wrong: Bool[np.ndarray, " m"],
-        spans: Spans,
-    ) -> "Coasting":
+    def after(self, unseen: Numbers, right: Flags, wrong: Flags, spans: Spans) -> "Coasting":
         """Count the coasting that this frame decides: all `unseen` frames since a detection.
 
         They were right if the object is detected again and its prediction is right, and wrong if
@@ -182,22 +152,18 @@ class Duplicates(NamedTuple):
     - `objects`, `duplicates`: how many proved to be objects, and how many to be duplicates.
     """
 
-    elders: Int[np.ndarray, " m"] = np.zeros(0, int)
+    elders: Integers = np.zeros(0, int)
     objects: float = 0.0
     duplicates: float = 0.0
 
     @property
-    def doubtful(self) -> Bool[np.ndarray, " m"]:
+    def doubtful(self) -> Flags:
         """Which are more probably duplicates."""
         probability = (self.objects + PRIOR / 2) / (self.objects + self.duplicates + PRIOR)
         return (self.elders > 0) & (probability < _LEAST)
 
     def after(
-        self,
-        identities: Int[np.ndarray, " m"],
-        stays: Bool[np.ndarray, " k"],
-        detected: Bool[np.ndarray, " m"],
-        overlaps: Pairs,
+        self, identities: Integers, stays: Bool[np.ndarray, " k"], detected: Flags, overlaps: Pairs
     ) -> "Duplicates":
         """Count what this frame decides, and give new objects their elders.
 
@@ -225,6 +191,5 @@ class Duplicates(NamedTuple):
         new_elders[younger.rows[order] - k] = identities[younger.columns[order]]
         objects = KEPT * self.objects + np.sum(is_object)
         duplicates = KEPT * self.duplicates + ended
-        return Duplicates(
-            np.append(np.where(is_object, 0, elders), new_elders), objects, duplicates
-        )
+        elders = np.append(np.where(is_object, 0, elders), new_elders)
+        return Duplicates(elders, objects, duplicates)

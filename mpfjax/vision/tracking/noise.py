@@ -3,10 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.special import softmax
 
 from mpfjax.vision.tracking.gaussian import Gaussian, units
+from mpfjax.vision.tracking.pairs import Flags, Integers
 
 # Candidate deviations of detections, places and velocities, in boxes, wider than real ones. They
 # and the priors are for 25 frames a second.
@@ -78,7 +79,7 @@ class NoiseState(NamedTuple):
     noises: Noises
 
     @classmethod
-    def initial(cls, frames_per_second: float, coordinates: int = 4) -> "NoiseState":
+    def initial(cls, frames_per_second: float, coordinates: int) -> "NoiseState":
         """Before any frame: the means of the priors. Boxes move less evenly at a lower rate."""
         prior, _, speed = _BEFORE[coordinates]
         longer = min(25 / frames_per_second, _MOST)
@@ -96,11 +97,7 @@ class NoiseState(NamedTuple):
         return self._replace(moments=moments)
 
     def after(
-        self,
-        columns: Int[np.ndarray, " m"],
-        places: Float[np.ndarray, "d k"],
-        teaches: Bool[np.ndarray, " m"],
-        grown: Gaussian,
+        self, columns: Integers, places: Float[np.ndarray, "d k"], teaches: Flags, grown: Gaussian
     ) -> "NoiseState":
         """Update the objects by the detections in these columns, -1 for none, and the evidence.
 
@@ -137,18 +134,14 @@ class NoiseState(NamedTuple):
         return self._replace(evidence=evidence, squares=squares, newborn=newborn, noises=noises)
 
     def renew(
-        self,
-        stays: Bool[np.ndarray, " m"],
-        places: Float[np.ndarray, "n k"],
-        speed: Float[np.ndarray, " k"],
+        self, stays: Flags, places: Float[np.ndarray, "n k"], speed: Float[np.ndarray, " k"]
     ) -> "NoiseState":
         """Without the objects that end, and with new ones at these places while there is room."""
         moments, followed = self.moments.at(stays[self.followed]), self.followed[stays]
         is_followed = np.arange(len(places)) < _FOLLOWED - len(moments.place)
         unit = units(places[is_followed])[:, None]
-        newborns = Gaussian.initial(
-            places[is_followed, None], unit * _RIVALS[self.evidence.shape[1]][0], unit * speed
-        )
+        errors = _RIVALS[self.evidence.shape[1]][0]
+        newborns = Gaussian.initial(places[is_followed, None], unit * errors, unit * speed)
         followed = np.append(followed, is_followed)
         return self._replace(followed=followed, moments=moments.append(newborns))
 

@@ -5,6 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+# A value for each of m objects.
+Numbers = Float[np.ndarray, " m"]
+Integers = Int[np.ndarray, " m"]
+Flags = Bool[np.ndarray, " m"]
+
 
 class Pairs(NamedTuple):
     """The possible pairs of m rows and d columns, each with a value.

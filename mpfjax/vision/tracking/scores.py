@@ -23,10 +23,14 @@ KEPT = 0.995  # kept from each frame to the next
 _SAME, _DUPLICATE = 0.3, 0.6  # least overlap of boxes in a chain, and of a box with its duplicate
 _GONE = 2  # longest gap in a chain, in frames with detections
 
+Boxes, Scores = Float[np.ndarray, "d k"], Float[np.ndarray, " d"]
+Chains = Float[np.ndarray, "c k"]
+
 
 class ScoreState(NamedTuple):
     """The scores so far, chains of detections that overlap from frame to frame, and their fates.
 
+    - `lasting`: frames after which a chain is an object.
     - `recent`: the latest scores, at most 8192.
     - `weak`, `strong`: the least score that counts, and from which on a detection is strong.
     - `boxes`: (c, 4), the last box of each living chain, or (c, 2), moved with the camera; `steps`:
@@ -37,6 +41,7 @@ class ScoreState(NamedTuple):
       ended before.
     """
 
+    lasting: float
     recent: Float[np.ndarray, " k"]
     weak: float
     strong: float
@@ -50,22 +55,21 @@ class ScoreState(NamedTuple):
     bad: Float[np.ndarray, " bins"]
 
     @classmethod
-    def initial(cls, coordinates: int = 4) -> "ScoreState":
+    def initial(cls, coordinates: int, lasting: float) -> "ScoreState":
         """No score seen yet, and no chain."""
         none, bins = np.zeros(0, int), np.zeros(_BINS)
         boxes, steps, pending = (np.zeros((0, width)) for width in (coordinates, 2, _BINS))
         chains = boxes, steps, none, 0.0 * none, none > 0, pending
-        return cls(np.zeros(0), 0.0, 0.0, *chains, bins, bins)
+        return cls(lasting, np.zeros(0), 0.0, 0.0, *chains, bins, bins)
 
     def after(
         self,
-        boxes: Float[np.ndarray, "d k"],
-        scores: Float[np.ndarray, " d"],
+        boxes: Boxes,
+        scores: Scores,
         overlaps: Pairs,
-        moved: Float[np.ndarray, "c k"],
+        moved: Chains,
         frames: float,
-        lasting: float,
-        variance: float = 2.0,
+        variance: float,
     ) -> "ScoreState":
         """Remember the frame's scores, continue the chains, and set the thresholds.
 
@@ -93,20 +97,14 @@ class ScoreState(NamedTuple):
         single = np.ones(len(boxes), bool)
         is_same = (overlaps.rows < overlaps.columns) & (overlaps.values > _DUPLICATE)
         single[overlaps.columns[is_same]] = False
-        state = self._continue(boxes[single], moved, shares[single], frames, lasting, variance)
+        state = self._continue(boxes[single], shares[single], moved, frames, variance)
         strong = lowest + state.strong_share() * spread
         # Where all scores are equal, rounding must not put them below the threshold.
         weak = min(lowest + WEAK * spread, strong) if len(recent) else -np.inf
         return state._replace(recent=recent, weak=weak, strong=strong)
 
     def _continue(
-        self,
-        detections: Float[np.ndarray, "d k"],
-        moved: Float[np.ndarray, "c k"],
-        shares: Float[np.ndarray, " d"],
-        frames: float,
-        lasting: float,
-        variance: float,
+        self, detections: Boxes, shares: Scores, moved: Chains, frames: float, variance: float
     ) -> "ScoreState":
         """The chains after a frame whose detections have these shares of a sure score."""
         since = frames * (1 + self.unseen[:, None])
@@ -132,7 +130,7 @@ class ScoreState(NamedTuple):
         bins = np.clip((share_of_each * _BINS).astype(int), 0, _BINS - 1)
         pending[is_detected, bins[is_detected]] += 1
         age = np.append(self.age + frames, none + 1)
-        is_sure = is_detected & ((share_of_each >= _SURE) | (age >= lasting))
+        is_sure = is_detected & ((share_of_each >= _SURE) | (age >= self.lasting))
         sure = np.append(self.sure, none > 0) | is_sure
         unseen = np.where(is_detected, 0, np.append(self.unseen, none) + 1)
         ended = unseen >= _GONE

@@ -3,18 +3,16 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mpfjax.checks import Renamed
 from mpfjax.vision.files.boxes import top_left
+from mpfjax.vision.tracking.associate import Clutter, Likeness
 from mpfjax.vision.tracking.camera import CameraState
-from mpfjax.vision.tracking.clutter import Clutter
-from mpfjax.vision.tracking.detections import FAULTS
 from mpfjax.vision.tracking.gaussian import Gaussian
 from mpfjax.vision.tracking.lives import Coasting, Duplicates, Lives
 from mpfjax.vision.tracking.noise import NoiseState
 from mpfjax.vision.tracking.scores import ScoreState
-from mpfjax.vision.tracking.vectors import Likeness
 
 
 class TrackerState(NamedTuple):
@@ -34,8 +32,7 @@ class TrackerState(NamedTuple):
       frames it has not run since.
     - `time`: in seconds, of the last frame; None if unknown.
     - `forms`: (3,), of the first boxes, as in `FrameDetections.form_counts`.
-    - `number`: the number of frames so far; `left_out`: (3,), how many detections could not be
-      tracked, by `FAULTS`.
+    - `number`: the number of frames so far; `has_faults`: whether a detection could not be tracked.
     """
 
     objects: Gaussian
@@ -55,7 +52,7 @@ class TrackerState(NamedTuple):
     waited: float = 0.0
     time: float | None = None
     number: int = 0
-    left_out: Int[np.ndarray, "3"] = np.zeros(len(FAULTS), int)
+    has_faults: bool = False
     forms: Int[np.ndarray, "3"] = np.zeros(3, int)
     begun = Renamed("begun", "has_begun")
 
@@ -75,24 +72,22 @@ class Tracks(NamedTuple):
     - `probabilities`: (m,), that this detection is the object's own; 0 if there is none.
     - `classes`: (m,), the class of each, the first that its detections had; 0 for none.
     - `scores`: (m,), the score of the latest detection of each, 1 if detections have none.
-    - `left_out`: how many detections of this frame could not be tracked.
     - `number`: of the frame, as files and `track` count them; frames of `step` count from 1.
     """
 
-    boxes: Float[Array | np.ndarray, "m k"]
-    identities: Int[Array | np.ndarray, " m"]
-    confirmed: Bool[Array | np.ndarray, " m"]
-    unseen: Float[Array | np.ndarray, " m"]
-    full: Bool[Array, ""] | bool
-    shown: Bool[Array | np.ndarray, " m"]
-    detections: Int[Array | np.ndarray, " m"]
-    probabilities: Float[Array | np.ndarray, " m"]
-    classes: Int[Array | np.ndarray, " m"]
-    scores: Float[Array | np.ndarray, " m"]
-    left_out: Int[np.ndarray, ""] | int = 0
-    number: int = 0
+    boxes: Float[np.ndarray, "m k"]
+    identities: Int[np.ndarray, " m"]
+    confirmed: Bool[np.ndarray, " m"]
+    unseen: Float[np.ndarray, " m"]
+    full: bool
+    shown: Bool[np.ndarray, " m"]
+    detections: Int[np.ndarray, " m"]
+    probabilities: Float[np.ndarray, " m"]
+    classes: Int[np.ndarray, " m"]
+    scores: Float[np.ndarray, " m"]
+    number: int
 
     @property
     def corner_boxes(self) -> Float[np.ndarray, "m k"]:
         """The boxes (x, y, w, h) with (x, y) the top-left corner, as in files; or points."""
-        return top_left(np.asarray(self.boxes))
+        return top_left(self.boxes)

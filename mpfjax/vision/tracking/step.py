@@ -5,51 +5,34 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mpfjax.vision.tracking.associate import (
-    compatible,
-    learned_descriptors,
-    mahalanobis,
-    one_to_one,
-    probabilities,
-    unlikeness,
-)
+from mpfjax.checks import warn
+from mpfjax.vision.tracking import associate, gaussian
 from mpfjax.vision.tracking.camera import find_jolt
-from mpfjax.vision.tracking.detections import FrameDetections
-from mpfjax.vision.tracking.gaussian import (
-    CameraMotion,
-    Gaussian,
-    along,
-    boxes_of,
-    overlapping,
-    shared,
-    units,
-    within,
-)
-from mpfjax.vision.tracking.kinds import Kind
+from mpfjax.vision.tracking.detections import FrameDetections, Kind
+from mpfjax.vision.tracking.gaussian import CameraMotion, Gaussian
 from mpfjax.vision.tracking.lives import Lives, Spans
-from mpfjax.vision.tracking.pairs import Pairs
+from mpfjax.vision.tracking.pairs import Flags, Integers, Numbers, Pairs
 from mpfjax.vision.tracking.scores import STRONG, WEAK
 from mpfjax.vision.tracking.state import TrackerState, Tracks
-from mpfjax.vision.tracking.vectors import cosine_distances
 
 if TYPE_CHECKING:
     from mpfjax.vision.tracking.tracker import ObjectTracker
 
-# Of a weak detection, of an object that is not confirmed, and of one of another class.
-_WEAK_COST, _DOUBT_COST, _CLASS_COST = 8.0, 2.0, 8.0
+_WEAK_COST, _DOUBT_COST = 8.0, 2.0  # of a weak detection, and an object that is not confirmed
 WEAK_ERROR = 1.35  # times the error of a strong detection
 _YIELDING = 0.01  # of the claim of an object that takes only what others leave
 _BIRTH_OVERLAP = 0.5  # with an object or a stronger detection: it is one more box of the same
 _SAME = 0.5  # least overlap of a prediction that was right with the detection
 _CONTACT = 0.12  # an overlap from which on objects would learn each other's colours
 _FIRST = 3  # strong detections of an object after which it teaches the noises
+Born = Int[np.ndarray, " b"]  # the rows of detections at which objects begin
 
 
 class _Frame(NamedTuple):
     """A frame's detections, and how they compare with the objects and with each other.
 
     - `frames`: since the last frame on which the detector ran.
-    - `places`: (d, k), of the detections; `scores`: (d,), all equal if these are not to count.
+    - `places`: (d, k), of the detections.
     - `costs`: (m, d), what pairs cost beside distance; `distances`: (m, d), cosine distances of
       their vectors, (0, 0) without any.
     - `overlaps`: of detections that may be of one object.
@@ -60,7 +43,6 @@ class _Frame(NamedTuple):
     frames: float
     spans: Spans
     places: Float[np.ndarray, "d k"]
-    scores: Float[np.ndarray, " d"]
     costs: Float[np.ndarray, "m d"]
     distances: Float[np.ndarray, "a b"]
     overlaps: Pairs
@@ -76,18 +58,18 @@ class _Matches(NamedTuple):
     - `probabilities`: (m,), that it is the object's own; `gains`: (m,), of the object's log-odds.
     """
 
-    columns: Int[np.ndarray, " m"]
-    matched: Bool[np.ndarray, " m"]
-    strong: Bool[np.ndarray, " m"]
-    probabilities: Float[np.ndarray, " m"]
-    gains: Float[np.ndarray, " m"]
+    columns: Integers
+    matched: Flags
+    strong: Flags
+    probabilities: Numbers
+    gains: Numbers
 
     def values(self, values: np.ndarray, none: Any) -> np.ndarray:
         """The value of each object's detection, or another where there is none."""
         filled = np.concatenate([values, np.full((1, *values.shape[1:]), none, values.dtype)])
         return filled[self.columns]
 
-    def renew(self, stays: Bool[np.ndarray, " m"], born: Int[np.ndarray, " b"]) -> "_Matches":
+    def renew(self, stays: Flags, born: Born) -> "_Matches":
         """The matches of the objects that stay, and of those that begin at detections."""
         sure = np.ones(len(born))
         new = born, sure > 0, sure > 0, sure, 0.0 * sure
@@ -110,13 +92,14 @@ def advance(
         # Objects move on, and nothing is held against them.
         state = state._replace(scores=state.scores._replace(boxes=chains), full=False)
         none = np.full(len(state.lives.num_strong), -1)
-        return state, _tracks(tracker.kind, state, none, np.zeros(len(none)), 0)
-    detections.warn_of_first(state.left_out)
-    state = state._replace(forms=detections.form_counts(state.forms))
+        return state, _tracks(tracker.kind, state, none, np.zeros(len(none)))
+    if detections.warning and not state.has_faults:
+        warn(detections.warning)
+    has_faults = state.has_faults or bool(detections.warning)
+    state = state._replace(forms=detections.form_counts(state.forms), has_faults=has_faults)
     state, frame = _compare(tracker, state, detections, frames)
-    is_known = motion is not None and bool(motion.known)
-    state, shift = _with_camera(tracker.kind, state, frame, is_known, displacements)
-    state, frame = _judge(tracker, state, frame, chains + along(chains, shift))
+    state, shift = _with_camera(tracker.kind, state, frame, motion is not None, displacements)
+    state, frame = _judge(tracker, state, frame, chains + gaussian.along(chains, shift))
     return _associate(tracker, state, frame)
 
 
@@ -127,19 +110,16 @@ def _associate(
     matches = _match(tracker.kind, state, frame)
     predicted, state = state.objects, _update(state, frame, matches)
     state, stays = _survive(state, frame, matches, predicted)
-    is_birth = _births(tracker, state, frame, matches, stays)
+    is_birth = _births(state, frame, matches, stays)
     born = np.flatnonzero(is_birth)[: tracker.max_objects - np.sum(stays)]
     state = _renew(tracker.kind, state, frame, matches, stays, born)
     renewed = matches.renew(stays, born)
-    state = _describe(tracker, state, frame, matches, renewed, stays)
-    number, detections = len(frame.places) - int(matches.matched.sum()), frame.detections
-    state = state._replace(
-        clutter=state.clutter.after(frame.places, number if state.has_begun else 0),
-        full=bool(np.sum(is_birth) > len(born)), has_begun=True, waited=0.0,
-        left_out=state.left_out + detections.left_out,
-    )  # fmt: skip
-    rows, left_out = renewed.values(detections.rows, -1), int(detections.left_out.sum())
-    return state, _tracks(tracker.kind, state, rows, renewed.probabilities, left_out)
+    state = _describe(state, frame, matches, renewed, stays)
+    number = len(frame.places) - int(matches.matched.sum()) if state.has_begun else 0
+    clutter, full = state.clutter.after(frame.places, number), bool(np.sum(is_birth) > len(born))
+    state = state._replace(clutter=clutter, full=full, has_begun=True, waited=0.0)
+    rows = renewed.values(frame.detections.rows, -1)
+    return state, _tracks(tracker.kind, state, rows, renewed.probabilities)
 
 
 def _frames_since(
@@ -179,27 +159,21 @@ def _compare(
     tracker: "ObjectTracker", state: TrackerState, detections: FrameDetections, frames: float
 ) -> tuple[TrackerState, _Frame]:
     """What pairs cost beside distance, and which detections may be of one object."""
-    if not tracker.class_matters:
-        detections = detections._replace(classes=np.zeros_like(detections.classes))
     classes, colours, vectors = detections.classes, detections.colours, detections.vectors
-    other_class = _CLASS_COST if tracker.class_matters == "prefers" else np.inf
     costs = np.broadcast_to(0.0, (len(state.lives.classes), len(classes)))
     if state.lives.classes.any() and classes.any():
-        costs = np.where(compatible(state.lives.classes[:, None], classes), costs, other_class)
+        costs = np.where(associate.compatible(state.lives.classes[:, None], classes), costs, np.inf)
     if colours is not None:
-        costs = costs + unlikeness(colours, state.colours)
+        costs = costs + associate.unlikeness(colours, state.colours)
     distances = np.zeros((0, 0))
     if vectors is not None:
         state = _with_vectors(state, vectors.shape[1])
-        distances = cosine_distances(state.vectors, vectors)
+        distances = associate.cosine_distances(state.vectors, vectors)
         costs = costs + state.likeness.cost(distances)
     boxes = detections.boxes
-    overlaps = _of_one_class(tracker, overlapping(boxes, boxes), classes, classes)
-    spans, scores = Spans.at(tracker.rate, tracker.lost_seconds), detections.scores
-    if tracker.scores == "ignore":
-        scores = np.ones_like(scores)
-    about = detections.places, scores, costs, distances, overlaps
-    return state, _Frame(detections, frames, spans, *about)
+    overlaps = _of_one_class(gaussian.overlapping(boxes, boxes, 0.0), classes, classes)
+    places = gaussian.places_of(boxes)
+    return state, _Frame(detections, frames, tracker.spans, places, costs, distances, overlaps)
 
 
 def _with_vectors(state: TrackerState, size: int) -> TrackerState:
@@ -211,47 +185,53 @@ def _with_vectors(state: TrackerState, size: int) -> TrackerState:
 
 
 def _with_camera(
-    kind: Kind,
-    state: TrackerState,
-    frame: _Frame,
-    is_known: bool,
-    displacements: Float[np.ndarray, "m 2"],
+    kind: Kind, state: TrackerState, frame: _Frame, is_known: bool, displacements: np.ndarray
 ) -> tuple[TrackerState, Float[np.ndarray, "2"]]:
     """Objects moved with what they have in common beside the motion from pixels, and by how far."""
     if not kind.has_boxes:
         return state, np.zeros(2)
-    lives, errors = state.lives, state.noise.noises.errors
-    places, scores, costs = frame.places, frame.scores, frame.costs
-    num_strong = np.where(lives.confirmed & (lives.unseen == 0), lives.num_strong, 0)
-    counts, strong = (scores >= least for least in (state.scores.weak, state.scores.strong))
-    cost = mahalanobis(state.objects, errors, places, costs)
-    near = np.zeros(len(num_strong), bool)
-    near[cost.rows[(cost.values < 0) & counts[cost.columns]]] = True
-    jolt = find_jolt(state.objects, errors, places, costs, num_strong, near, counts)
-    objects, confirmed = state.objects.shift(jolt), lives.confirmed
+    errors, confirmed = state.noise.noises.errors, state.lives.confirmed
+    cost = associate.mahalanobis(state.objects, errors, frame.places, frame.costs)
+    jolt = _jolt(state, frame, cost)
+    objects = state.objects.shift(jolt)
     if jolt.any():
-        cost = mahalanobis(objects, errors, places, costs)
-    box = np.exp(objects.place[confirmed, 2:].sum(axis=0) / max(confirmed.sum(), 1))
+        cost = associate.mahalanobis(objects, errors, frame.places, frame.costs)
+    # An object and a detection tell the motion if each has its least cost with the other.
+    strong = frame.detections.scores >= state.scores.strong
     cost = cost.at(confirmed[cost.rows] & strong[cost.columns])
-    about = objects, displacements + jolt, is_known, cost, errors, places, box
-    camera, shift = state.camera.after(*about)
+    partner = cost._replace(values=-cost.values).partners
+    rows = np.flatnonzero(partner >= 0)
+    gaps = (frame.places[partner[rows]] - objects.place[rows])[:, :2]
+    variances = (objects.var_place + (objects.unit * errors) ** 2)[rows, :2]
+    box = np.exp(objects.place[confirmed, 2:].sum(axis=0) / max(confirmed.sum(), 1))
+    camera, shift = state.camera.after(gaps, variances, (displacements + jolt)[rows], is_known, box)
     shift = jolt + shift
     noise = state.noise._replace(moments=state.noise.moments.shift(shift))
     objects = state.objects.shift(shift)
     return state._replace(objects=objects, noise=noise, camera=camera), shift
 
 
+def _jolt(state: TrackerState, frame: _Frame, cost: Pairs) -> Float[np.ndarray, "2"]:
+    """The shift of a jolt after which most objects have no detection near them, or zero."""
+    lives, counts = state.lives, frame.detections.scores >= state.scores.weak
+    near = np.unique(cost.rows[(cost.values < 0) & counts[cost.columns]])
+    lately = np.flatnonzero(lives.confirmed & (lives.unseen == 0) & (lives.num_strong > 0))
+    lately = lately[np.argsort(-lives.num_strong[lately], kind="stable")]
+    num_near = int(np.isin(lately, near).sum())
+    if 2 * num_near > len(lately) or len(lately) < num_near + 2:
+        return np.zeros(2)
+    errors, unlike = state.noise.noises.errors, frame.costs[np.ix_(lately, counts)]
+    return find_jolt(state.objects.at(lately), errors, frame.places[counts], unlike, num_near)
+
+
 def _judge(
-    tracker: "ObjectTracker", state: TrackerState, frame: _Frame, chains: Float[np.ndarray, "c k"]
+    tracker: "ObjectTracker", state: TrackerState, frame: _Frame, chains: np.ndarray
 ) -> tuple[TrackerState, _Frame]:
     """With the thresholds of the scores, and which detections are strong."""
-    variance, scores = 2.0, frame.scores
+    variance, boxes, scores = 2.0, frame.detections.boxes, frame.detections.scores
     if not tracker.kind.has_boxes:
         variance += float(np.mean(state.noise.noises.speed**2))
-    learned = state.scores.after(
-        frame.detections.boxes, scores, frame.overlaps, chains, frame.frames,
-        frame.spans.lasting, variance,
-    )  # fmt: skip
+    learned = state.scores.after(boxes, scores, frame.overlaps, chains, frame.frames, variance)
     if tracker.scores == "as_given":
         learned = learned._replace(weak=WEAK, strong=STRONG)
     frame = frame._replace(strong=scores >= learned.strong, counts=scores >= learned.weak)
@@ -262,17 +242,17 @@ def _match(kind: Kind, state: TrackerState, frame: _Frame) -> _Matches:
     """The detection of each object, and the probability that it is its own."""
     others = 0.0 if kind.has_boxes else state.clutter.cost
     errors = state.noise.noises.errors
-    distance = mahalanobis(state.objects, errors, frame.places, frame.costs, others)
+    distance = associate.mahalanobis(state.objects, errors, frame.places, frame.costs, others)
     distance = distance.at(frame.counts[distance.columns])
     costs = distance.values + np.where(frame.strong, 0.0, _WEAK_COST)[distance.columns]
     costs += np.where(state.lives.confirmed, 0.0, _DOUBT_COST)[distance.rows]
     distance, costs = distance.at(costs < 0), costs[costs < 0]
     claims = np.where(state.duplicates.doubtful, _YIELDING, 1.0)[distance.rows]
     cost = distance._replace(values=claims * costs)
-    columns = one_to_one(cost)
+    columns = associate.one_to_one(cost)
     matched, chosen = columns >= 0, columns[cost.rows] == cost.columns
     rows, probability = cost.rows[chosen], np.zeros(len(columns))
-    probability[rows] = probabilities(cost, kind.temperature)[chosen]
+    probability[rows] = associate.probabilities(cost, kind.temperature)[chosen]
     gains = np.where(matched, 0.0, kind.missed)
     if not kind.has_boxes:
         gains[rows] = -0.5 * distance.values[chosen]
@@ -285,7 +265,7 @@ def _update(state: TrackerState, frame: _Frame, matches: _Matches) -> TrackerSta
     rows = np.flatnonzero(matches.matched)
     before, place = state.objects.at(rows), frame.places[matches.columns[rows]]
     wider = np.where(matches.strong[rows], 1.0, WEAK_ERROR)[:, None]
-    updated, _, _ = before.update(place, units(place) * state.noise.noises.errors * wider)
+    updated, _, _ = before.update(place, gaussian.units(place) * state.noise.noises.errors * wider)
     objects = Gaussian(*map(np.copy, state.objects))
     objects.put(rows, updated.mix(before, matches.probabilities[rows, None]))
     return state._replace(objects=objects)
@@ -293,17 +273,18 @@ def _update(state: TrackerState, frame: _Frame, matches: _Matches) -> TrackerSta
 
 def _survive(
     state: TrackerState, frame: _Frame, matches: _Matches, predicted: Gaussian
-) -> tuple[TrackerState, Bool[np.ndarray, " m"]]:
+) -> tuple[TrackerState, Flags]:
     """Counts of frames, which objects live on, and how right the predictions of the lost were."""
     lives, spans, matched = state.lives, frame.spans, matches.matched
     coast = state.coasting.longest(spans)
+    lives_now = lives._replace(odds=lives.odds + matches.gains)
     counts = matched, matches.strong, frame.frames, spans, coast, state.full
-    lives_now, stays = lives.advance(*counts, matches.gains)
+    lives_now, stays = lives_now.advance(*counts)
     extent = frame.detections.extent
-    stays &= within(boxes_of(state.objects.place), extent, centred=~matched)
+    stays &= gaussian.within(gaussian.boxes_of(state.objects.place), extent, centred=~matched)
     right, rows = matched.copy(), np.flatnonzero(matched)
     boxes = frame.detections.boxes[matches.columns[rows]]
-    right[rows] = shared(boxes_of(predicted.place[rows]), boxes) >= _SAME
+    right[rows] = gaussian.shared(gaussian.boxes_of(predicted.place[rows]), boxes) >= _SAME
     ended = lives.confirmed & np.where(matched, ~right, ~stays)
     unseen = lives.unseen + np.where(matched, 0.0, frame.frames)
     coasting = state.coasting.after(unseen, lives.confirmed & right, ended, spans)
@@ -311,17 +292,14 @@ def _survive(
 
 
 def _births(
-    tracker: "ObjectTracker",
-    state: TrackerState,
-    frame: _Frame,
-    matches: _Matches,
-    stays: Bool[np.ndarray, " m"],
+    state: TrackerState, frame: _Frame, matches: _Matches, stays: Flags
 ) -> Bool[np.ndarray, " d"]:
     """Which strong detections begin an object: no object has them, or is there already."""
-    boxes, classes, extent = (getattr(frame.detections, n) for n in ("boxes", "classes", "extent"))
-    covered = overlapping(boxes_of(state.objects.place[stays]), boxes, _BIRTH_OVERLAP)
-    covered = _of_one_class(tracker, covered, state.lives.classes[stays], classes)
-    is_birth = frame.strong & within(boxes, extent)
+    boxes, classes = frame.detections.boxes, frame.detections.classes
+    objects = gaussian.boxes_of(state.objects.place[stays])
+    covered = gaussian.overlapping(objects, boxes, _BIRTH_OVERLAP)
+    covered = _of_one_class(covered, state.lives.classes[stays], classes)
+    is_birth = frame.strong & gaussian.within(boxes, frame.detections.extent)
     is_birth[covered.columns] = is_birth[matches.columns[matches.matched]] = False
     others = frame.overlaps.at(frame.overlaps.values > _BIRTH_OVERLAP)
     is_first = others.rows < others.columns
@@ -330,12 +308,7 @@ def _births(
 
 
 def _renew(
-    kind: Kind,
-    state: TrackerState,
-    frame: _Frame,
-    matches: _Matches,
-    stays: Bool[np.ndarray, " m"],
-    born: Int[np.ndarray, " b"],
+    kind: Kind, state: TrackerState, frame: _Frame, matches: _Matches, stays: Flags, born: Born
 ) -> TrackerState:
     """Without the objects that end, and with those that begin; the former teach the noises."""
     objects, lives, noises = state.objects, state.lives, state.noise.noises
@@ -345,12 +318,12 @@ def _renew(
     grown = objects.at(teaches & (lives.num_strong == _FIRST))
     noise = state.noise.after(matches.columns, frame.places, experienced, grown)
     noise = noise.renew(stays, places, noises.speed)
-    unit = units(places)
+    unit = gaussian.units(places)
     start = Gaussian.initial(places, unit * noises.errors, unit * noises.speed)
     names = state.last_identity + 1 + np.arange(len(born))
     # The scores of a first frame have hardly a rank: a single one is always the highest.
     is_first = kind.has_boxes and not state.has_begun
-    at_once = is_first & (frame.scores[born] >= STRONG)
+    at_once = is_first & (frame.detections.scores[born] >= STRONG)
     new_lives = Lives.initial(names, frame.detections.classes[born], at_once, kind.odds)
     colours, vectors = (
         np.append(rows[stays], np.zeros((len(born), rows.shape[1])), axis=0)
@@ -364,19 +337,15 @@ def _renew(
 
 
 def _describe(
-    tracker: "ObjectTracker",
-    state: TrackerState,
-    frame: _Frame,
-    matches: _Matches,
-    renewed: _Matches,
-    stays: Bool[np.ndarray, " m"],
+    state: TrackerState, frame: _Frame, matches: _Matches, renewed: _Matches, stays: np.ndarray
 ) -> TrackerState:
     """Scores, classes, colours and vectors of the objects, and which are second boxes."""
-    detections, matched = frame.detections, renewed.matched
-    values = renewed.values(detections.classes, 0), renewed.values(detections.scores, 0.0)
-    lives = state.lives.describe(matched, *values)
-    boxes = boxes_of(state.objects.place)
-    overlaps = _of_one_class(tracker, overlapping(boxes, boxes), lives.classes, lives.classes)
+    detections, matched, lives = frame.detections, renewed.matched, state.lives
+    classes = np.where(lives.classes > 0, lives.classes, renewed.values(detections.classes, 0))
+    scores = np.where(matched, renewed.values(detections.scores, 0.0), lives.scores)
+    lives = lives._replace(classes=classes, scores=scores)
+    boxes = gaussian.boxes_of(state.objects.place)
+    overlaps = _of_one_class(gaussian.overlapping(boxes, boxes, 0.0), lives.classes, lives.classes)
     duplicates = state.duplicates.after(lives.identities, stays, matched, overlaps)
     lives = lives._replace(shown=lives.shown & ~duplicates.doubtful)
     contacts = overlaps.rows[overlaps.values > _CONTACT]  # each overlaps itself
@@ -384,10 +353,10 @@ def _describe(
     colours, vectors, likeness = state.colours, state.vectors, state.likeness
     if detections.colours is not None:
         values = renewed.values(detections.colours, 0.0)
-        colours = learned_descriptors(colours, values, alone)
+        colours = associate.learned_descriptors(colours, values, alone)
     if detections.vectors is not None:
         values = renewed.values(detections.vectors, 0.0)
-        vectors = learned_descriptors(vectors, values, alone)
+        vectors = associate.learned_descriptors(vectors, values, alone)
         same = matches.columns[:, None] == np.arange(len(frame.places))
         likeness = likeness.after(frame.distances, same)
     return state._replace(
@@ -395,21 +364,13 @@ def _describe(
     )
 
 
-def _tracks(
-    kind: Kind, state: TrackerState, rows: np.ndarray, probability: np.ndarray, left_out: int
-) -> Tracks:
+def _tracks(kind: Kind, state: TrackerState, rows: Integers, probabilities: Numbers) -> Tracks:
     lives = state.lives
-    boxes = boxes_of(state.objects.place) * kind.unit
+    boxes = gaussian.boxes_of(state.objects.place) * kind.unit
     about = lives.identities, lives.confirmed, lives.unseen, state.full, lives.shown
-    return Tracks(
-        boxes, *about, rows, probability, lives.classes, lives.scores, left_out, state.number
-    )
+    return Tracks(boxes, *about, rows, probabilities, lives.classes, lives.scores, state.number)
 
 
-def _of_one_class(
-    tracker: "ObjectTracker", pairs: Pairs, a: Int[np.ndarray, " m"], b: Int[np.ndarray, " d"]
-) -> Pairs:
+def _of_one_class(pairs: Pairs, a: Int[np.ndarray, " m"], b: Int[np.ndarray, " d"]) -> Pairs:
     """The pairs that may be of one object by their classes."""
-    if tracker.class_matters == "prefers":
-        return pairs
-    return pairs.at(compatible(a[pairs.rows], b[pairs.columns]))
+    return pairs.at(associate.compatible(a[pairs.rows], b[pairs.columns]))

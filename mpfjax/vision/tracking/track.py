@@ -1,9 +1,12 @@
 """The loop over frames: from video and detections, or detections alone, to tracks."""
 
 import contextlib
-from collections.abc import Generator, Iterable, Iterator
+import contextvars
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
@@ -11,22 +14,17 @@ from jaxtyping import Array, Float, Key, UInt8
 from mpfjax.checks import Count, Finite, checked, one_of, warn
 from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.files.frames import of_one_kind, read_frames
-from mpfjax.vision.files.threads import read_ahead
-from mpfjax.vision.tracking.adapters import (
-    LEAST_ROOM,
-    Rows,
-    as_detector,
-    first_step,
-    observe,
-)
-from mpfjax.vision.tracking.detections import Detections, FrameDetections
+from mpfjax.vision.tracking.adapters import LEAST_ROOM, Rows, as_detector, first_step, observe
+from mpfjax.vision.tracking.detections import BOXES, FrameDetections
 from mpfjax.vision.tracking.gaussian import CameraMotion
-from mpfjax.vision.tracking.kinds import BOXES, Kind
-from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
+from mpfjax.vision.tracking.opencv import OpticalFlow, has_opencv
 from mpfjax.vision.tracking.state import Tracks
 from mpfjax.vision.tracking.step import advance
 from mpfjax.vision.tracking.tracker import ObjectTracker, with_colours
 
+# So many frames wait between threads, enough to even out frames of different cost; one of 4K has
+# 25 MB.
+_WAITING = 4
 _STRONGEST = "; the strongest are kept (here and wherever else it is so)"
 
 
@@ -87,16 +85,16 @@ def track(
       less time; with a camera, tracks would be late.
 
     Coordinates may be large, as on maps. Boxes that are not finite, have no area or are outside the
-    frame are ignored; the first of each kind causes a warning, and `Tracks.left_out` counts them.
-    There are warnings for detections in frames after the last, and for more detections or objects
-    than there is room for. Raises `ValueError` with the name of the argument for values that cannot
-    be used, at the frame in which they occur, for a row more than a minute after the previous one
-    if there are no `frames`, and `ImportError` for "pixels" without OpenCV. An exception of the
-    detector is passed on, with the number of the frame. Use it for recorded videos and for cameras.
+    frame are ignored, and the first causes a warning. There are warnings for detections in frames
+    after the last, and for more detections or objects than there is room for. Raises `ValueError`
+    with the name of the argument for values that cannot be used, at the frame in which they occur,
+    for a row more than a minute after the previous one if there are no `frames`, and `ImportError`
+    for "pixels" without OpenCV. An exception of the detector is passed on, with the number of the
+    frame. Use it for recorded videos and for cameras.
     """
     del key
-    coordinates = (BOXES if tracker is None else tracker.kind).coordinates
-    detector = as_detector(detections, coordinates)
+    kind = BOXES if tracker is None else tracker.kind
+    detector = as_detector(detections, kind.coordinates)
     if frames is None and (callable(detector) or camera_motion == "pixels"):
         raise ValueError("frames: None; a detector, and camera_motion 'pixels', need them")
     if tracker is None:
@@ -107,62 +105,38 @@ def track(
         own_times: list[float] = []
         frames = read_frames(frames, first, times=own_times)
         times = own_times if times is None else times
-    room = 2 * tracker.max_objects if max_detections is None else max_detections
+    times = iter(() if times is None else times)
     stills = None if frames is None else of_one_kind(frames, first)
     if camera_motion is None and stills is not None and use_colours and has_opencv():
         camera_motion = "pixels"
     flow = OpticalFlow() if camera_motion == "pixels" else None
-    observations = observe(stills, detector, first, coordinates)
-    times = iter(() if times is None else times)
-    inputs = _inputs(
-        observations, times, frame_size, min_score, room, use_colours, flow, tracker.kind
-    )
-    return _track(inputs, tracker, ahead)
+    room = 2 * tracker.max_objects if max_detections is None else max_detections
+
+    def inputs() -> Iterator[_Inputs]:
+        """What does not depend on earlier tracks, frame by frame."""
+        is_warned = False
+        for number, still, output in observe(stills, detector, first):
+            trackable, motion = None, None
+            size = frame_size if still is None else still.shape[:2]
+            if output is not None:
+                trackable = FrameDetections.of(output, number, size, kind, min_score)
+                if len(trackable.rows) > room and not is_warned:
+                    excess = f"frame {number} has {len(trackable.rows)}, more than the {room}"
+                    warn(f"detections: {excess} of max_detections{_STRONGEST}")
+                    is_warned = True
+                trackable = trackable.strongest(room)
+                if use_colours and still is not None and kind.has_boxes:
+                    trackable = with_colours(trackable, still)
+            if flow is not None and still is not None:
+                has_boxes = trackable is not None and kind.has_boxes
+                motion = flow(still, top_left(trackable.boxes) if has_boxes else None)
+            yield number, trackable, motion, next(times, None)
+
+    return _track(inputs(), tracker, ahead)
 
 
-class _Inputs(NamedTuple):
-    """All that a step takes of a frame."""
-
-    number: int
-    detections: FrameDetections | None
-    motion: CameraMotion | None
-    time: float | None
-
-
-def _inputs(
-    frames: Iterator[tuple[int, np.ndarray | None, Detections | None]],
-    times: Iterator[float],
-    frame_size: tuple[int, int] | None,
-    min_score: float | None,
-    room: int,
-    use_colours: bool,
-    flow: OpticalFlow | None,
-    kind: Kind,
-) -> Iterator[_Inputs]:
-    """What does not depend on earlier tracks, frame by frame."""
-    is_warned = False
-    for number, still, detections in frames:
-        trackable, motion = None, None
-        size = frame_size if still is None else still.shape[:2]
-        if detections is not None:
-            if min_score is not None and len(detections.boxes) and detections.scores is None:
-                raise ValueError(f"min_score: {min_score}, and detections have no scores")
-            trackable = FrameDetections.of(detections, f"detections: frame {number}", size, kind)
-            if min_score is not None:
-                trackable = trackable.at(trackable.scores >= min_score)
-            if len(trackable.rows) > room and not is_warned:
-                excess = f"frame {number} has {len(trackable.rows)}, more than the {room}"
-                warn(f"detections: {excess} of max_detections{_STRONGEST}")
-                is_warned = True
-            trackable = trackable.at(slice(room))
-            if use_colours and still is not None and kind.has_boxes:
-                trackable = with_colours(trackable, still)
-        if flow is not None and still is not None:
-            boxes = None
-            if trackable is not None and kind.has_boxes:
-                boxes = top_left(trackable.boxes)
-            motion = flow(still, boxes)
-        yield _Inputs(number, trackable, motion, next(times, None))
+# The number of a frame, and what a step uses of it: detections, the camera's motion, the time.
+_Inputs = tuple[int, FrameDetections | None, CameraMotion | None, float | None]
 
 
 def _track(
@@ -177,6 +151,33 @@ def _track(
                 warn(f"tracker: {excess} of max_objects{_STRONGEST}")
                 is_warned = True
             yield tracks._replace(number=number)
+
+
+@contextlib.contextmanager
+def read_ahead(items: Iterable[Any]) -> Iterator[Iterator[Any]]:
+    """The items in their order, each made in one other thread before it is asked for.
+
+    The thread has this one's settings. An exception in making an item is raised in the place of the
+    item. Leaving the block ends the thread, which closes the items if they can be closed.
+    """
+    coming, end, context = iter(items), object(), contextvars.copy_context()
+
+    def start(call: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        return thread.submit(context.run, call, *arguments)
+
+    def take() -> Iterator[Any]:
+        while (item := waiting.popleft().result()) is not end:
+            waiting.append(start(next, coming, end))
+            yield item
+
+    with ThreadPoolExecutor(1) as thread:
+        waiting = deque(start(next, coming, end) for _ in range(_WAITING))
+        try:
+            yield take()
+        finally:
+            for future in waiting:
+                future.cancel()
+            start(getattr(items, "close", lambda: None)).result()
 
 
 # --- tracks as files have them -------------------------------------------------------------
@@ -200,34 +201,20 @@ def offline_rows(
     The columns are those of `online_rows`.
     """
     tracks_of_frames = list(tracks_of_frames)
-    identities = {0}
-    for tracks in tracks_of_frames:
-        identities |= set(np.asarray(tracks.identities)[np.asarray(tracks.shown)].tolist())
-    shown = np.array(sorted(identities - {0}))
-    rows = [
-        _rows(
-            tracks,
-            np.isin(tracks.identities, shown) & (tracks.shown | ~np.asarray(tracks.confirmed)),
-            described,
-        )
-        for tracks in tracks_of_frames
-    ]
+    shown = np.concatenate([np.zeros(0, int), *(t.identities[t.shown] for t in tracks_of_frames)])
     coordinates = tracks_of_frames[0].boxes.shape[1] if tracks_of_frames else 4
-    return np.concatenate([np.zeros((0, 2 + coordinates + 2 * described)), *rows])
+    rows = [np.zeros((0, 2 + coordinates + 2 * described))]
+    for tracks in tracks_of_frames:
+        written = np.isin(tracks.identities, shown) & (tracks.shown | ~tracks.confirmed)
+        rows.append(_rows(tracks, written, described))
+    return np.concatenate(rows)
 
 
-def _rows(tracks: Tracks, written: Any, described: bool) -> np.ndarray:
-    written = np.flatnonzero(np.asarray(written) & (np.asarray(tracks.identities) > 0))
-    corners = tracks.corner_boxes[written]
-    ids = np.asarray(tracks.identities)[written]
-    more = (tracks.scores, tracks.classes) if described else ()
-    rows = np.column_stack(
-        [
-            np.full(len(ids), tracks.number),
-            ids,
-            corners,
-            *(np.asarray(each)[written] for each in more),
-        ]
-    )
+def _rows(tracks: Tracks, written: np.ndarray, described: bool) -> np.ndarray:
+    written = np.flatnonzero(written & (tracks.identities > 0))
+    names = tracks.identities[written]
+    columns = [np.full(len(names), tracks.number), names, tracks.corner_boxes[written]]
+    if described:
+        columns += [tracks.scores[written], tracks.classes[written]]
     # Rounded as in files, so that scores are the same from a file.
-    return np.round(rows[np.argsort(ids, kind="stable")], 3)
+    return np.round(np.column_stack(columns)[np.argsort(names, kind="stable")], 3)

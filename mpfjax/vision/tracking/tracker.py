@@ -7,12 +7,10 @@ import numpy as np
 from jaxtyping import Array, Key, UInt8
 
 from mpfjax.checks import Checked, Count, Finite, Positive, checked
-from mpfjax.vision.colour.bins import HSVColours
-from mpfjax.vision.colour.histograms import sampled_histograms
-from mpfjax.vision.tracking.detections import Detections, FrameDetections
+from mpfjax.vision.colour import HSVColours, sampled_histograms
+from mpfjax.vision.tracking.detections import BOXES, FrameDetections, Kind, kind_of_points
 from mpfjax.vision.tracking.gaussian import CameraMotion, Gaussian
-from mpfjax.vision.tracking.kinds import Kind
-from mpfjax.vision.tracking.lives import Lives
+from mpfjax.vision.tracking.lives import Lives, Spans
 from mpfjax.vision.tracking.noise import NoiseState
 from mpfjax.vision.tracking.scores import ScoreState
 from mpfjax.vision.tracking.state import TrackerState, Tracks
@@ -51,24 +49,20 @@ class ObjectTracker(Checked):
       each coordinate, instead of boxes: radar detections, keypoints, animals in aerial images.
     - `scores`: "rank" estimates the score from which a detection is strong, and starts an object,
       on any scale. "as_given" interprets scores as probabilities: strong from .5 on, and a
-      detection below .2 is ignored. "ignore" treats all as strong.
-    - `class_matters`: with True objects are matched with detections of their own class only, and
-      those of another class are not duplicates. "prefers" is for detectors that confuse classes:
-      another class is penalised as much as a weak score. False ignores classes. Class 0 is none,
-      and matches all.
+      detection below .2 is ignored.
+
+    Objects are matched with detections of their own class only, and detections of another class are
+    not duplicates. Class 0 is none, and matches all.
 
     Raises `ValueError` for a number of objects that is not an integer, or below 1, a rate that is
-    not positive, and scores or classes that are none of these.
+    not positive, and scores that are none of these.
     """
 
     max_objects: Count = eqx.field(static=True, default=24)
     frames_per_second: Positive | None = eqx.field(static=True, default=None, kw_only=True)
     lost_seconds: Positive | None = eqx.field(static=True, default=None, kw_only=True)
     point_deviation: Positive | None = eqx.field(static=True, default=None, kw_only=True)
-    scores: Literal["rank", "as_given", "ignore"] = eqx.field(
-        static=True, default="rank", kw_only=True
-    )
-    class_matters: Literal["prefers"] | bool = eqx.field(static=True, default=True, kw_only=True)
+    scores: Literal["rank", "as_given"] = eqx.field(static=True, default="rank", kw_only=True)
 
     @property
     def rate(self) -> float:
@@ -78,15 +72,20 @@ class ObjectTracker(Checked):
     @property
     def kind(self) -> Kind:
         """The kind of the detections: boxes or points."""
-        return Kind.of(self.point_deviation)
+        return BOXES if self.point_deviation is None else kind_of_points(self.point_deviation)
+
+    @property
+    def spans(self) -> Spans:
+        """Numbers of frames at this rate."""
+        return Spans.at(self.rate, self.lost_seconds)
 
     def init(self) -> TrackerState:
         """The state before the first frame: no objects."""
         none, coordinates = np.zeros(0, int), self.kind.coordinates
         return TrackerState(
             objects=Gaussian.none(coordinates),
-            lives=Lives.initial(none, none, at_once=none > 0),
-            scores=ScoreState.initial(coordinates),
+            lives=Lives.initial(none, none, none > 0, 0.0),
+            scores=ScoreState.initial(coordinates, self.spans.lasting),
             noise=NoiseState.initial(self.rate, coordinates),
             colours=np.zeros((0, _BANDS * _COLOURS.num_bins)),
         )
@@ -101,21 +100,19 @@ class ObjectTracker(Checked):
         motion: CameraMotion | None = None,
         *,
         time: Finite | None = None,
-        frame_size: tuple[int, int] | None = None,
     ) -> tuple[TrackerState, Tracks]:
         """The state after a frame and its detections, and the tracks in it.
 
         `detections` are the same as from a detector of `track`: boxes, (boxes, scores), (boxes,
         scores, classes), or `Detections`; with `point_deviation` points instead of boxes; None if
         it did not run, which is not "no objects". Detections that cannot be tracked are ignored as
-        by `track`, and counted in the state. If `frame` is None, colours are not used. Nothing is
+        by `track`. If `frame` is None, colours are not used. Nothing is
         random: the key may be None.
 
         - `motion`: the result of `OpticalFlow` for the frames; None estimates it from the
           detections.
         - `time`: in seconds, for frames that are not equally spaced; None is the next frame by
           `frames_per_second`.
-        - `frame_size`: height and width, if there is no frame and they are known.
 
         Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, for a time that is not
         after the previous one, and for detections as `Detections.of` does.
@@ -123,11 +120,9 @@ class ObjectTracker(Checked):
         del key
         trackable = None
         if detections is not None:
-            named, kind = f"detections: frame {state.number + 1}", self.kind
-            size = frame_size if frame is None else np.shape(frame)[:2]
-            detections = Detections.of(detections, named, kind.coordinates)
-            trackable = FrameDetections.of(detections, named, size, kind)
-            if frame is not None and kind.has_boxes:
+            size = None if frame is None else np.shape(frame)[:2]
+            trackable = FrameDetections.of(detections, state.number + 1, size, self.kind)
+            if frame is not None and self.kind.has_boxes:
                 trackable = with_colours(trackable, frame)
         return advance(self, state, trackable, motion, time)
 

@@ -1,20 +1,22 @@
 """Colour histograms of boxes: of many from one integral histogram, of a few by a grid of points."""
 
 from functools import partial
-from itertools import pairwise
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Shaped, UInt8
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8
 
+from mpfjax.checks import Checked, Count
 from mpfjax.operations.stored import stored
-from mpfjax.vision.colour.bins import AbstractColours
 from mpfjax.vision.files.frames import check_frame
 
 Histograms = Float[Array, "#n parts channels bins"]
-
+Numbers = Float[np.ndarray, " n"]
+# Where a pixel has less of either, its hue is not reliable (Pérez et al. 2002).
+_LEAST_SATURATION, _LEAST_VALUE = 0.1, 0.2
 SURROUND = 2.0
 # A box of more pixels cannot be counted in 16 bits.
 LARGEST_NARROW = 2**16 - 1
@@ -22,6 +24,92 @@ LARGEST_NARROW = 2**16 - 1
 _BINS_STEP, _LEAST_WIDTH = 16, 48
 # The grid of points in a box.
 _ROWS, _COLUMNS = 18, 8
+
+
+class RGBColours(Checked):
+    """Red, green and blue separately, each in `num_bins` equal bins.
+
+    Vermaak et al. (2003), section 5.2. Raises `ValueError` for a number of bins below 1.
+    """
+
+    num_bins: Count = eqx.field(static=True, default=30)
+
+    num_channels = 3
+    """How many histograms a box has."""
+
+    def bins(self, frame: UInt8[Any, "h w 3"]) -> Int[Any, "h w 3"]:
+        """Red, green and blue in steps of 256 / num_bins."""
+        return frame.astype(jnp.int32) * self.num_bins // 256
+
+
+class HSVColours(Checked):
+    """Hue and saturation jointly, and the value of pixels with little colour.
+
+    N = N_h N_s + N_v bins in one histogram, Lin et al. (2012), section 2.1, after Pérez, Hue,
+    Vermaak and Gangnet (2002). A pixel with a saturation of at least .1 and a value of at least .2
+    (both in [0, 1]) is counted in one of N_h N_s bins of hue and saturation. The hue of any other
+    pixel is unreliable: the pixel is counted in one of N_v bins of value. Use it if the
+    illumination changes, or if one histogram should replace three.
+
+    Raises `ValueError` for a number of bins below 1.
+    """
+
+    num_hues: Count = eqx.field(static=True, default=10, kw_only=True)
+    num_saturations: Count = eqx.field(static=True, default=10, kw_only=True)
+    num_values: Count = eqx.field(static=True, default=10, kw_only=True)
+
+    num_channels = 1
+    """How many histograms a box has."""
+
+    @property
+    def num_bins(self) -> int:
+        """N = N_h N_s + N_v."""
+        return self.num_hues * self.num_saturations + self.num_values
+
+    def bins(self, frame: UInt8[Any, "h w 3"]) -> Int[Any, "h w 1"]:
+        """Hue N_s + saturation if there is colour, N_h N_s + value otherwise."""
+        hue, saturation, value = hue_saturation_value(frame)
+        coloured = (saturation >= _LEAST_SATURATION) & (value >= _LEAST_VALUE)
+        colour = _bin(hue, self.num_hues) * self.num_saturations
+        colour += _bin(saturation, self.num_saturations)
+        grey = self.num_hues * self.num_saturations + _bin(value, self.num_values)
+        return _numpy_of(frame).where(coloured, colour, grey)[:, :, None]
+
+
+def _numpy_of(frame: Any) -> Any:
+    """NumPy for its own arrays, JAX's for others."""
+    return np if isinstance(frame, np.ndarray) else jnp
+
+
+def hue_saturation_value(
+    frame: UInt8[Any, "h w 3"],
+) -> tuple[Float[Any, "h w"], Float[Any, "h w"], Float[Any, "h w"]]:
+    """Hue, saturation and value of each pixel in [0, 1], by the usual hexcone.
+
+    Hue runs from red at 0 through green at 1/3 and blue at 2/3; it is 0 where there is no colour.
+    By NumPy where the frame is an array of it, without compiling anything.
+    """
+    xp = _numpy_of(frame)
+    red, green, blue = (frame[:, :, i].astype(xp.float32) for i in range(3))
+    high = xp.maximum(xp.maximum(red, green), blue)
+    chroma = high - xp.minimum(xp.minimum(red, green), blue)
+    unit = xp.where(chroma > 0, chroma, 1.0)
+    from_red = (green - blue) / unit
+    sector = xp.where(
+        high == red,
+        xp.where(from_red < 0, from_red + 6, from_red),
+        xp.where(high == green, (blue - red) / unit + 2, (red - green) / unit + 4),
+    )
+    hue = xp.where(chroma > 0, sector / 6, 0.0)
+    saturation = chroma / xp.where(high > 0, high, 1.0)
+    return hue, saturation, high / 255
+
+
+def _bin(share: Float[Any, "h w"], num_bins: int) -> Int[Any, "h w"]:
+    return (share * num_bins).astype(jnp.int32).clip(0, num_bins - 1)
+
+
+Colours = RGBColours | HSVColours
 
 
 class IntegralHistogram(eqx.Module):
@@ -35,39 +123,36 @@ class IntegralHistogram(eqx.Module):
       around in 16 bits, which cancels in the difference of corners as long as a box holds fewer
       than 65 536 pixels.
     - `num_channels`, `num_bins`: of the colours that were counted; static.
-    - `height`, `width`: of the frame in pixels; static.
     """
 
     table: Shaped[Array, "rows columns k"]
     num_channels: int = eqx.field(static=True)
     num_bins: int = eqx.field(static=True)
-    height: int = eqx.field(static=True)
-    width: int = eqx.field(static=True)
 
-    @property
-    def largest_box(self) -> int:
-        """The most pixels a box may hold and still be counted exactly."""
-        return int(min(np.iinfo(self.table.dtype).max, np.iinfo(np.int32).max))
-
-    def counts(self, boxes: Float[Array, "n 4"], num_parts: int = 1) -> Histograms:
+    def counts(self, boxes: Float[Array, "n 4"], num_parts: int) -> Histograms:
         """Pixels of each colour in each box, cut into `num_parts` bands from top to bottom.
 
         Boxes are (x, y, w, h) about their centre, in pixels, and the frame spans [0, width] x [0,
         height]. A pixel belongs to a box that covers its centre. Boxes that leave the frame are
         clipped to it. A box that lies wholly outside, has no area or is not finite has zero counts.
-        The counts of a box with more than `largest_box` pixels are NaN, since zeros would mean that
-        it has none of a colour.
+        The counts of a box of more pixels than a number of the table can hold are NaN, since zeros
+        would mean that it has none of a colour.
         """
-        edges = jnp.concatenate(box_edges(boxes, num_parts, self.height, self.width), axis=1)
+        height, width = self.table.shape[0] - 1, self.table.shape[1] - 1
+        x, y, w, h = (boxes[:, i, None] for i in range(4))
+        across = jnp.array([[-0.5, 0.5]], boxes.dtype)
+        down = jnp.linspace(-0.5, 0.5, num_parts + 1, dtype=boxes.dtype)[None]
+        edges = _pixel(y + h * down, height), _pixel(x + w * across, width)
         # Otherwise XLA finds them again in each operation that uses the counts.
-        edges = stored(edges)
+        edges = stored(jnp.concatenate(edges, axis=1))
         rows, columns = edges[:, : num_parts + 1], edges[:, num_parts + 1 :]
         corners = self.table.at[rows[:, :, None], columns[:, None, :]].get(mode="clip")
         bands = jnp.diff(corners[:, :, 1] - corners[:, :, 0], axis=1)
         pixels = (rows[:, -1] - rows[:, 0]) * (columns[:, 1] - columns[:, 0])
         # An unsigned count is never negative, so an inverted box must be silenced by its edges.
         valid = (columns[:, 1] > columns[:, 0]) & (rows[:, -1] > rows[:, 0])
-        too_large = valid & (pixels > self.largest_box)
+        most = min(np.iinfo(self.table.dtype).max, np.iinfo(np.int32).max)
+        too_large = valid & (pixels > most)
         instead = jnp.where(too_large, jnp.nan, 0.0).astype(boxes.dtype)
         counts = bands.reshape(boxes.shape[0], num_parts, self.num_channels, -1)
         counts = counts[..., : self.num_bins].astype(boxes.dtype)
@@ -76,7 +161,7 @@ class IntegralHistogram(eqx.Module):
 
 
 def integral_histogram(
-    frame: UInt8[Array, "h w 3"], colours: AbstractColours, wide_counts: bool = False
+    frame: UInt8[Array, "h w 3"], colours: Colours, wide_counts: bool
 ) -> IntegralHistogram:
     """Build the integral histogram of an RGB frame, whose pixels `colours` sorts into bins.
 
@@ -84,21 +169,18 @@ def integral_histogram(
     pixels or more. Raises `ValueError` for a frame of one channel or not of eight bits.
     """
     check_frame(frame)
-    height, width, _ = frame.shape
     table = _table(frame, colours, wide_counts)
-    return IntegralHistogram(table, colours.num_channels, colours.num_bins, height, width)
+    return IntegralHistogram(table, colours.num_channels, colours.num_bins)
 
 
 def normalise(
-    counts: Float[Array, "... bins"], bin_weights: Float[Array, "... bins"] | None = None
+    counts: Float[Array, "... bins"], weights: Float[Array, "... bins"] | float = 1.0
 ) -> Float[Array, "... bins"]:
-    """Counts as shares that sum to one over the bins.
+    """Counts as shares that sum to one over the bins, by the weights of these.
 
     All zero where nothing was counted, and where counts are NaN; derivatives are then zero too.
     """
-    counts = jnp.where(counts >= 0, counts, 0.0)
-    if bin_weights is not None:
-        counts = counts * jnp.broadcast_to(bin_weights, counts.shape)
+    counts = jnp.where(counts >= 0, counts, 0.0) * weights
     total = jnp.sum(counts, axis=-1, keepdims=True)
     return jnp.where(total > 0, counts / jnp.where(total > 0, total, 1.0), 0.0)
 
@@ -119,11 +201,13 @@ def _table(frame, colours, wide_counts):
     dtype = jnp.dtype(jnp.uint32 if wide_counts else jnp.uint16)
     # Pixels of no colour fill the row above, and the column to the left.
     bins = jnp.pad(colours.bins(frame), ((1, 0), (1, 0), (0, 0)), constant_values=-1)
-    num_bins = _stored_bins(colours.num_bins, colours.num_channels)
-    above = jnp.zeros((bins.shape[1], colours.num_channels * num_bins), dtype)
+    # The table has room for so many bins of a channel; no pixel falls into the last of them.
+    least = max(colours.num_bins, -(-_LEAST_WIDTH // colours.num_channels))
+    each = jnp.arange(-(-least // _BINS_STEP) * _BINS_STEP)[None, None]
+    above = jnp.zeros((bins.shape[1], colours.num_channels * each.size), dtype)
 
     def add_row(above: Array, row: Array) -> tuple[Array, Array]:
-        below = above + _one_hot(row, num_bins, dtype)
+        below = above + (row[:, :, None] == each).astype(dtype).reshape(above.shape)
         return below, below
 
     table = jax.lax.scan(add_row, above, bins)[1]
@@ -134,58 +218,27 @@ def _table(frame, colours, wide_counts):
     return jax.lax.fori_loop(1, bins.shape[1], add_left, table)
 
 
-def _stored_bins(num_bins: int, num_channels: int) -> int:
-    """How many bins of a channel the table has room for; no pixel falls into the last of them."""
-    least = max(num_bins, -(-_LEAST_WIDTH // num_channels))
-    return -(-least // _BINS_STEP) * _BINS_STEP
-
-
-def _one_hot(row: Int[Array, "w channels"], num_bins: int, dtype: jnp.dtype) -> Array:
-    one_hot = (row[:, :, None] == jnp.arange(num_bins)[None, None]).astype(dtype)
-    return one_hot.reshape(row.shape[0], -1)
-
-
-def box_edges(
-    boxes: Float[Array, "n 4"], num_parts: int, height: int, width: int
-) -> tuple[Int[Array, "n rows"], Int[Array, "n 2"]]:
-    """The rows at which the bands of each box begin and end, and its first column and its end."""
-    x, y, w, h = (boxes[:, i, None] for i in range(4))
-    across = jnp.array([[-0.5, 0.5]], boxes.dtype)
-    down = jnp.linspace(-0.5, 0.5, num_parts + 1, dtype=boxes.dtype)[None]
-    return _pixel(y + h * down, height), _pixel(x + w * across, width)
-
-
 def _pixel(edges: Float[Array, "n e"], size: int) -> Int[Array, "n e"]:
     """The first pixel whose centre lies at or past each edge, within [0, size]."""
     inside = jnp.clip(jnp.nan_to_num(edges, nan=0.0), -1.0, size + 1.0)
     return jnp.clip(jnp.ceil(inside - 0.5).astype(jnp.int32), 0, size)
 
 
-# --- references: the colours of boxes in a frame, by which their objects are recognised -------
-
-
 def reference_histograms(
-    frame: UInt8[np.ndarray, "h w 3"],
-    colours: AbstractColours,
-    places: Float[Array, "k 4"],
-    num_parts: int,
-    weigh_colours: bool,
+    table: IntegralHistogram, places: Float[Array, "k 4"], num_parts: int, weigh_colours: bool
 ) -> tuple[Histograms, Histograms]:
-    """The normalised histograms of the reference boxes, and the weights of their colours."""
-    # NumPy counts: boxes differ in size, and a program for each would have to be compiled.
-    bins, inner, outer = map(
-        np.asarray, _assign_bins(jnp.asarray(frame), colours, places, num_parts)
-    )
-    counts, within = (
-        jnp.asarray(_counts(bins, edges, colours.num_bins), places.dtype)
-        for edges in (inner, outer)
-    )
-    return _weigh(counts, within, weigh_colours)
+    """The normalised histograms of reference boxes, and the weights of their colours."""
+    count = eqx.filter_jit(IntegralHistogram.counts)
+    around = places * jnp.array([[1.0, 1.0, SURROUND, SURROUND]], places.dtype)
+    return _weigh(count(table, places, num_parts), count(table, around, 1), weigh_colours)
 
 
 @eqx.filter_jit
 def _weigh(counts, within, weigh_colours):
-    """Histograms by the counts in boxes and in their surroundings, and the weights of colours."""
+    """Histograms by the counts in boxes and in their surroundings, and the weights of colours.
+
+    A colour is weighed by its share in the box relative to its share in the surroundings.
+    """
     weights = jnp.ones_like(counts)
     if weigh_colours:
         inside = normalise(counts)
@@ -195,40 +248,11 @@ def _weigh(counts, within, weigh_colours):
     return normalise(counts, weights), weights
 
 
-@eqx.filter_jit
-def _assign_bins(frame, colours, places, num_parts):
-    """The bin of each pixel; the edges of each box and its bands, and those of its surroundings.
-
-    The edges of a box are the rows at which its bands begin and end, its first column and its end.
-    """
-    around = places * jnp.array([[1.0, 1.0, SURROUND, SURROUND]], places.dtype)
-    inner, outer = (
-        jnp.concatenate(box_edges(boxes, parts, *frame.shape[:2]), axis=1)
-        for boxes, parts in ((places, num_parts), (around, 1))
-    )
-    return colours.bins(frame), inner, outer
-
-
-def _counts(
-    bins: Int[np.ndarray, "h w channels"], edges: Int[np.ndarray, "k edges"], num_bins: int
-) -> Int[np.ndarray, "k parts channels bins"]:
-    """Pixels of each colour in each band of each box; none in a box without area."""
-
-    def count(pixels: Int[np.ndarray, "rows columns channels"]) -> list[np.ndarray]:
-        each = np.moveaxis(pixels, -1, 0).reshape(pixels.shape[-1], -1)
-        return [np.bincount(channel, minlength=num_bins) for channel in each]
-
-    return np.array([
-        [count(bins[top:bottom, left:right]) for top, bottom in pairwise(rows)]
-        for *rows, left, right in edges.tolist()
-    ])  # fmt: skip
-
-
 def sampled_histograms(
     frame: UInt8[np.ndarray, "h w 3"],
     boxes: Float[np.ndarray, "d 4"],
-    colours: AbstractColours,
-    num_parts: int = 1,
+    colours: Colours,
+    num_parts: int,
 ) -> Float[np.ndarray, "d parts channels bins"]:
     """The colours of a few boxes (x, y, w, h) about their centres, at a grid of points in each.
 
@@ -240,8 +264,7 @@ def sampled_histograms(
     d, channels, num_bins = len(boxes), colours.num_channels, colours.num_bins
     row, down = _points(boxes[:, 1], boxes[:, 3], _ROWS, frame.shape[0])
     column, across = _points(boxes[:, 0], boxes[:, 2], _COLUMNS, frame.shape[1])
-    pixels = np.asarray(frame)[row[:, :, None], column[:, None, :]]
-    pixels = pixels.reshape(d, _ROWS * _COLUMNS, 3)
+    pixels = np.asarray(frame)[row[:, :, None], column[:, None, :]].reshape(d, _ROWS * _COLUMNS, 3)
     shape = d, num_parts, _ROWS * _COLUMNS // num_parts
     drawn = np.asarray(colours.bins(pixels)).reshape(*shape, channels)
     inside = (down[:, :, None] & across[:, None, :]).reshape(*shape, 1)
@@ -254,8 +277,8 @@ def sampled_histograms(
 
 
 def _points(
-    centres: np.ndarray, lengths: np.ndarray, number: int, size: int
-) -> tuple[np.ndarray, np.ndarray]:
+    centres: Numbers, lengths: Numbers, number: int, size: int
+) -> tuple[Int[np.ndarray, "n p"], Bool[np.ndarray, "n p"]]:
     """The pixels of points at the centres of equal parts, and whether they are in the frame."""
     shares = (np.arange(number, dtype=centres.dtype) + 0.5) / number - 0.5
     places = np.expand_dims(centres, 1) + np.expand_dims(lengths, 1) * np.expand_dims(shares, 0)

@@ -1,1 +1,0 @@
-"""Colour histograms of boxes: bins, sums, references."""
