@@ -40,7 +40,6 @@ DIFFERENT = {
     "reassembly",  # the paper's of its filter; the unbiased one of a move
     "regroup_every",  # a Gaussian of two modes loses both, a component of particles does not
     "resample",  # where None is the one that fits the number of targets
-    "threshold",  # a share of islands; grey levels
 }
 
 

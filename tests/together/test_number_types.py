@@ -110,7 +110,7 @@ TAKEN = {
     "gospa": (lambda x: metrics.gospa(OTHERS, x, cutoff=3.0), [[1, 6], [0, 3]]),
     "expectation": (MIXTURE.expectation, [0, 100, 200, 255]),
     "Detections": (
-        lambda x: np.asarray(Detections.of(x, "boxes").boxes),
+        lambda x: np.asarray(Detections.of(x, "boxes", 4).boxes),
         [[2.0, 3.0, 4.0, 5.0], [6.0, 1.0, 2.0, 2.0]],
     ),
     "kalman_filter": (lambda x: kalman_filter(KNOWN, x), [[1], [2], [3]]),
