@@ -5,11 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.colors import rgb_to_hsv
 
 from mpfjax.vision.colour import (
     HSVColours,
     RGBColours,
     bhattacharyya,
+    hue_saturation_value,
     integral_histogram,
     normalise,
     sampled_histograms,
@@ -125,3 +127,37 @@ def test_every_point_counts_once(colours, num_parts):
     expected = np.stack([one_by_one(SMALL, box, colours, 18, 8, num_parts) for box in BOXES])
     expected /= np.maximum(expected.sum(axis=-1, keepdims=True), 1)
     np.testing.assert_allclose(shares, expected, rtol=1e-12)
+
+
+# --- the bins of pixels ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def kinds():
+    """Every kind of pixel: random ones, pure colours, greys, black and white."""
+    image = np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8)
+    image[0, :8] = 255 * np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1)
+    image[1] = np.linspace(0, 255, 50).astype(np.uint8)[:, None]
+    return image
+
+
+def test_hue_saturation_and_value_are_matplotlibs(kinds):
+    found = np.stack(hue_saturation_value(jnp.asarray(kinds)), axis=-1)
+    np.testing.assert_allclose(found, rgb_to_hsv(kinds / 255.0), atol=1e-6)
+
+
+@pytest.mark.exactness
+def test_hsv_counts_by_colour_or_by_value(kinds):
+    """N_h N_s + N_v bins in one histogram."""
+    hue, saturation, value = np.moveaxis(rgb_to_hsv(kinds / 255.0), -1, 0)
+    h, s, v = (np.minimum((x * n).astype(int), n - 1) for x, n in
+               ((hue, 5), (saturation, 4), (value, 3)))  # fmt: skip
+    bins = np.where((saturation >= 0.1) & (value >= 0.2), 4 * h + s, 20 + v)
+    expected = np.bincount(bins.ravel(), minlength=23)
+    assert expected.min() > 0
+    colours = HSVColours(num_hues=5, num_saturations=4, num_values=3)
+    table = integral_histogram(jnp.asarray(kinds), colours, False)
+    counts = table.counts(jnp.array([[25.0, 20.0, 50.0, 40.0]]), 1)
+    assert counts.shape == (1, 1, 1, 23)
+    # Float32 may put a pixel on the border of two bins into the other one.
+    assert np.abs(np.asarray(counts[0, 0, 0]) - expected).sum() <= 10

@@ -182,7 +182,7 @@ def test_an_error_of_the_detector_says_in_which_frame():
     numbers = itertools.count(1)
     with pytest.raises(OSError, match="no network") as caught:
         tracked(stills(), detector)
-    assert "detector at frame 2" in str(caught.value)
+    assert "detector at frame 2" in caught.value.__notes__[0]
 
 
 def test_a_damaged_frame_is_predicted_and_later_ones_keep_their_numbers():
