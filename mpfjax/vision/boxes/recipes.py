@@ -222,9 +222,14 @@ def follow_boxes(
     for t, still in enumerate(itertools.chain([initial], stills)):
         # An array: each new Python number would compile anew.
         counted = None if still is None else count(model, still)
-        mixture, tracks, growth = advance(filter, len(boxes), key, np.asarray(t), mixture, counted)
-        tracks = jax.device_get(with_densities(tracks, growth))
-        yield tracks._replace(number=first + t)
+        about = filter, len(boxes), key, np.asarray(t), mixture, counted
+        mixture, boxes_now, growth = advance(*about)
+        means, exists = jax.device_get(with_densities(boxes_now, growth))
+        none, names = np.zeros(len(boxes), int), np.where(exists, 1 + np.arange(len(boxes)), 0)
+        yield Tracks(
+            means, names, exists, none, False, shown=exists, detections=none - 1,
+            probabilities=0.0 * none, classes=none, scores=1.0 + none, number=first + t,
+        )  # fmt: skip
 
 
 def _advance_boxes(filter, num_objects, key, t, mixture, counted):
@@ -232,11 +237,4 @@ def _advance_boxes(filter, num_objects, key, t, mixture, counted):
     mixture, info = filter._step(step_keys, mixture, counted)
     best, exists = best_components(mixture, num_objects)
     means = mixture.component_expectations(filter.model.boxes(mixture.particles))
-    none, numbers = jnp.zeros(num_objects, jnp.int32), jnp.arange(1, num_objects + 1)
-    never, always = jnp.zeros(num_objects), jnp.ones(num_objects)
-    tracks = Tracks(
-        means[best], jnp.where(exists, numbers, 0), exists, unseen=none, full=jnp.asarray(False),
-        shown=exists, detections=none - 1, probabilities=never, classes=none, scores=always,
-        number=none[0],
-    )  # fmt: skip
-    return mixture, tracks, info.log_likelihood_increment
+    return mixture, (means[best], exists), info.log_likelihood_increment

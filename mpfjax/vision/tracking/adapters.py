@@ -124,7 +124,8 @@ def observe(
     Warns of detections after the last frame.
     """
     frames, number = _frames_of(detector), first - 1
-    coming = iter(()) if frames is not None or callable(detector) else iter(detector)
+    is_numbered = isinstance(detector, Rows | Mapping)
+    coming = iter(()) if is_numbered or callable(detector) else iter(detector)
     if stills is not None:
         steps = enumerate(stills, first)
     elif frames is None:

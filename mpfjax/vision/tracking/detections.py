@@ -76,7 +76,8 @@ class Detections(NamedTuple):
         """
         if not isinstance(output, cls):
             several = isinstance(output, tuple) and len(output) in (2, 3)
-            output = cls(*output) if several else cls(output)
+            parts: Any = output if several else (output,)
+            output = cls(*parts)
         rows, (scores, classes, vectors) = to_rows(coordinates, named, output.boxes), output[1:]
         if scores is not None:
             scores = _one_each(named, "scores", scores, len(rows))

@@ -128,8 +128,8 @@ def track(
                 if use_colours and still is not None and kind.has_boxes:
                     trackable = with_colours(trackable, still)
             if flow is not None and still is not None:
-                has_boxes = trackable is not None and kind.has_boxes
-                motion = flow(still, top_left(trackable.boxes) if has_boxes else None)
+                boxes = trackable.boxes if trackable is not None and kind.has_boxes else None
+                motion = flow(still, None if boxes is None else top_left(boxes))
             yield number, trackable, motion, next(times, None)
 
     return _track(inputs(), tracker, ahead)
