@@ -298,6 +298,31 @@ def test_each_particle_is_weighed_down_by_the_other_components_means():
     np.testing.assert_array_equal(moved.particles, mixture.particles)
 
 
+def test_objects_are_weighed_down_by_the_others_and_not_by_hypotheses_about_themselves():
+    """Object 0 is at 1 with 4/5 of its weight and at 50 with 1/5, object 1 at 5 with all of it."""
+    places = np.array([0.0, 2.0, 50.0, 4.0, 6.0])
+    states = np.stack([places, [0, 0, 0, 1, 1]], axis=1)
+    mixture = make_mixture(states, np.log([0.2, 0.2, 0.1, 0.3, 0.2]), [0, 0, 1, 2, 2], 4)
+    move = Exclusion(
+        strength=2.0, radius=0.5, scale=(10.0,), features=lambda states: states[:, :1],
+        group=lambda states: states[:, 1].astype(np.int32),
+    )  # fmt: skip
+    moved = eqx.filter_jit(move)(KEY, mixture, mpfjax.Step(MODEL, jnp.float32(0.0)))
+    near = lambda a, b: np.exp(-(((a - b) / 10) ** 2) / (2 * 0.5**2))  # noqa: E731
+    of_object_0 = [2 * near(x, 5.0) for x in places[:3]]
+    of_object_1 = [2 * (0.8 * near(x, 1.0) + 0.2 * near(x, 50.0)) for x in places[3:]]
+    penalty = np.asarray(mixture.log_weights - moved.log_weights)
+    np.testing.assert_allclose(penalty, of_object_0 + of_object_1, atol=1e-5)
+
+
+def test_pruning_compares_within_a_group_only():
+    states = np.array([[0.0], [0.0], [0.0], [1.0]])
+    mixture = make_mixture(states, np.log([0.5, 5e-4, 4e-3, 1e-4]), [0, 1, 2, 3], 4)
+    prune = Prune(least_share=2e-3, group=lambda states: states[:, 0].astype(np.int32))
+    moved = prune(KEY, mixture, mpfjax.Step(MODEL, jnp.float32(0.0)))
+    assert moved.active.tolist() == [True, False, True, True]
+
+
 @pytest.mark.parametrize(("num_groups", "num_features"), [(3, 1), (12, 10)])
 def test_moments_of_groups_equal_those_of_numpy(num_groups, num_features):
     features = RNG.normal(size=(300, num_features)) + 5
