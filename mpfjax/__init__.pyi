@@ -64,12 +64,12 @@ from mpfjax.moves.objects.tracks import estimate_targets as estimate_targets
 from mpfjax.moves.objects.tracks import number_distribution as number_distribution
 from mpfjax.moves.objects.tracks import track_table as track_table
 from mpfjax.moves.propagation.marginalised import PropagateMarginalised as PropagateMarginalised
+from mpfjax.moves.propagation.marginalised import PropagateRegimes as PropagateRegimes
+from mpfjax.moves.propagation.marginalised import RegimeProposal as RegimeProposal
 from mpfjax.moves.propagation.nested import PropagateNested as PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate as Propagate
 from mpfjax.moves.propagation.proposals import GaussNewtonProposal as GaussNewtonProposal
 from mpfjax.moves.propagation.proposals import NetworkProposal as NetworkProposal
-from mpfjax.moves.propagation.regimes import PropagateRegimes as PropagateRegimes
-from mpfjax.moves.propagation.regimes import RegimeProposal as RegimeProposal
 from mpfjax.moves.regrouping.kmeans import KMeans as KMeans
 from mpfjax.moves.regrouping.merge import Exclusion as Exclusion
 from mpfjax.moves.regrouping.merge import Merge as Merge

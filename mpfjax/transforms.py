@@ -12,18 +12,14 @@ from mpfjax.moves.base import (
     AbstractPropagation,
     AbstractPropagationOfEach,
     AbstractProposal,
-    AbstractRegrouping,
     all_of,
     name_of,
 )
-from mpfjax.moves.every import Every
 from mpfjax.moves.initial import SelectInitial, require_propagation
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
-from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.moves.start.alarm import WatchStart
 from mpfjax.moves.start.restart import Restart
 
 
@@ -79,15 +75,13 @@ def with_quasi_monte_carlo(filter: Filter) -> Filter:
     """The filter with randomised quasi-Monte Carlo draws: sequential quasi-Monte Carlo.
 
     Gerber and Chopin (2015). All noise is "rqmc", including the noise of x_0 (see `Propagate`), and
-    the resamplings of the chain sort the particles along a Hilbert curve of their state, unless
-    they have a `sort_by`. Raises `ValueError` for a model or proposal that is not reparameterised.
-    Use it if mixture weights and likelihoods must be accurate.
+    the resamplings of the chain sort the particles along a Hilbert curve of their state. Raises
+    `ValueError` for a model or proposal that is not reparameterised. Use it if mixture weights and
+    likelihoods must be accurate.
     """
-
-    def in_order(move: Resample) -> Resample:
-        return dataclasses.replace(move, sort_by=HILBERT) if move.sort_by is None else move
-
-    ordered = _change_in_chain(filter, Resample, in_order)
+    ordered = _change_in_chain(
+        filter, Resample, lambda move: dataclasses.replace(move, along_curve=True)
+    )
     return _everywhere(ordered, "noise", "rqmc").replace(initial_noise="rqmc")
 
 
@@ -161,12 +155,8 @@ def with_initial_selection(filter: Filter, num_draws: Count = 4) -> Filter:
     broader, use `with_initialisation`.
     """
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
-    if num_draws > 1 and any(move.at_start for move in _restarts(filter)):
-        raise ValueError("filter: with_initialisation selects x_0 by more observations than y_1")
-    if num_draws == 1:
-        return filter.replace(initial_moves=others)
-    select = SelectInitial(num_draws, filter.initial_noise)
-    return filter.replace(initial_moves=[select, *others])
+    select = [SelectInitial(num_draws)] if num_draws > 1 else []
+    return filter.replace(initial_moves=[*select, *others])
 
 
 @checked
@@ -183,12 +173,7 @@ def with_initialisation(filter: Filter, num_observations: Count = 8) -> Filter:
     are then near a mode, and chance decides its weight. `num_observations` is L: as many as
     distinguish the modes. It is also the number for restarts.
     """
-    if any(move.at_start for move in _restarts(filter)):
-        raise ValueError("filter: it is initialised by its first observations already")
     initial = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
-    if not all(map(_regroups, initial)):
-        what = "its initial moves do more than regroup, but x_0 is to be replaced"
-        raise ValueError(f"filter: {what}")
     filter = filter.replace(initial_moves=initial)
     return _with_restart(filter, num_observations=num_observations, at_start=True)
 
@@ -199,10 +184,10 @@ def with_restarts(
 ) -> Filter:
     """The filter that recovers a state that restarts from the prior, when an alarm is raised.
 
-    The alarm is the one of `with_alarm`, with N draws if there is none yet. If its cumulative sum
-    has been positive for L steps or more, a sample of p(x_t | the last L observations) is added to
-    the hypotheses, weighted by its evidence and p. This step takes as long as the initialisation by
-    `with_initialisation`. A state that restarts is recovered L steps later at the earliest.
+    The alarm is the one of `with_alarm`. If its cumulative sum has been positive for L steps or
+    more, a sample of p(x_t | the last L observations) is added to the hypotheses, weighted by its
+    evidence and p. This step takes as long as the initialisation by `with_initialisation`. A state
+    that restarts is recovered L steps later at the earliest.
     `Restart` describes the model for which Ẑ is unbiased. For a filter with restarts, its settings
     are changed. Raises `ValueError` for a model that `with_initialisation` refuses. Use it if all
     hypotheses may be wrong: a robot that is carried away, a lost target.
@@ -211,51 +196,31 @@ def with_restarts(
     - `num_observations`: L: as many as distinguish the modes. It is also the number for
       `with_initialisation`.
     """
-    alarms = [move for move in filter.moves if isinstance(move, WatchStart | Restart)]
-    if not any(move.num_particles for move in alarms):
-        filter = with_alarm(filter, filter.num_particles)
-    return _with_restart(filter, num_observations=num_observations, probability=probability)
-
-
-def _restarts(filter: Filter) -> list[Restart]:
-    return [move for move in filter.moves if isinstance(move, Restart)]
-
-
-def _with_restart(filter: Filter, **settings: Any) -> Filter:
-    """The filter whose `Restart`, after the last move that does not regroup, has these settings.
-
-    An alarm of the filter is part of it.
-    """
-    if not _restarts(filter):
-        alarms = [move.num_particles for move in filter.moves if isinstance(move, WatchStart)]
-        moves = [move for move in filter.moves if not isinstance(move, WatchStart)]
-        place = 1 + max(t for t, move in enumerate(moves) if not _regroups(move))
-        grouping = [move for move in filter.initial_moves if _regroups(move)]
-        restart = Restart(grouping, num_particles=sum(alarms))
-        filter = filter.replace(moves=[*moves[:place], restart, *moves[place:]])
-    return _change_in_chain(filter, Restart, lambda move: dataclasses.replace(move, **settings))
-
-
-def _regroups(move: AbstractMove) -> bool:
-    """Whether it changes no particles, and at most regroups them."""
-    if isinstance(move, Every):
-        return all(map(_regroups, move.moves))
-    return isinstance(move, AbstractRegrouping | WatchStart)
+    settings = {"num_observations": num_observations, "probability": probability}
+    return _with_restart(filter, **settings, has_alarm=True)
 
 
 @checked
-def with_alarm(filter: Filter, num_particles: Count = 4096) -> Filter:
+def with_alarm(filter: Filter) -> Filter:
     """The filter that detects when all its hypotheses seem wrong: `FilterRun.alarm`.
 
     At each step the increment is compared with the evidence for a state that restarts from the
-    prior. It is estimated from `num_particles` draws of x_0, the same at each step, which take as
-    long as so many particles. After `with_initialisation` the alarm begins at step L + 1. Use it if
-    a lost target must be noticed.
+    prior. It is estimated from N draws of x_0, the same at each step, which take as long as the
+    filter's own. After `with_initialisation` the alarm begins at step L + 1. Use it if a lost
+    target must be noticed.
     """
-    if _restarts(filter):
-        return _with_restart(filter, num_particles=num_particles)
-    others = [move for move in filter.moves if not isinstance(move, WatchStart)]
-    return filter.replace(moves=[*others, WatchStart(num_particles)])
+    return _with_restart(filter, has_alarm=True)
+
+
+def _with_restart(filter: Filter, **settings: Any) -> Filter:
+    """The filter whose `Restart`, after the last move that changes weights, has these settings."""
+    if not any(isinstance(move, Restart) for move in filter.moves):
+        place = 1 + max(
+            (t for t, move in enumerate(filter.moves) if not move.keeps_mass), default=-1
+        )
+        restart = Restart(0, at_start=False, probability=None, has_alarm=False)
+        filter = filter.replace(moves=[*filter.moves[:place], restart, *filter.moves[place:]])
+    return _change_in_chain(filter, Restart, lambda move: dataclasses.replace(move, **settings))
 
 
 def _everywhere(filter: Filter, field: str, value: str) -> Filter:

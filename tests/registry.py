@@ -73,8 +73,7 @@ WITHIN_COMPONENTS: dict[str, AbstractResampling] = {
     "stratified": Resample("stratified"),
     "multinomial": Resample("multinomial"),
     "multinomial, adaptive": Resample("multinomial", ess_threshold=0.5),
-    "systematic, sorted": Resample(sort_by=lambda states: states[:, 0]),
-    "systematic, along a Hilbert curve, adaptive": Resample(ess_threshold=0.5, sort_by="hilbert"),
+    "systematic, along a Hilbert curve, adaptive": Resample(ess_threshold=0.5, along_curve=True),
     "stratified, fixed number, adaptive": Resample(
         "stratified", ess_threshold=0.5, particles_per_component=5
     ),
@@ -157,7 +156,7 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         ),
         "guided mpf": _mpf(m, proposal=GaussNewtonProposal()),
         "guided, sorted": _chain(
-            Resample(sort_by=lambda states: states.reshape(NUM_PARTICLES, -1)[:, 0]),
+            Resample(along_curve=True),
             m=m,
             proposal=GaussNewtonProposal(),
             then=[KMeans(2)],

@@ -64,9 +64,7 @@ def test_they_compose_on_a_chain_of_ones_own():
     every, propagate = filter.moves
     assert every.moves[0].scheme == "stratified"
     assert (propagate.noise, propagate.gradient, filter.initial_noise) == ("rqmc", "stop", "rqmc")
-    select = filter.initial_moves[0]
-    assert isinstance(select, SelectInitial)
-    assert select.noise == "rqmc"
+    assert isinstance(filter.initial_moves[0], SelectInitial)
     assert np.isfinite(mpfjax.run_filter(KEY, filter, OBSERVATIONS).log_marginal_likelihood)
 
 
@@ -79,10 +77,7 @@ def test_the_score_gradient_reaches_the_resampling_inside_of_moves():
 
 def test_point_sets_sort_the_chains_own_resampling_alone():
     filter = with_quasi_monte_carlo(mpfjax.auxiliary_particle_filter(MODEL, 16, PilotLookahead()))
-    assert filter.moves[0].resample.sort_by == "hilbert"
-    own = Resample(sort_by=lambda states: -states)
-    kept = with_quasi_monte_carlo(with_resampling(mpfjax.particle_filter(MODEL, 16), own))
-    assert kept.moves[0].sort_by is own.sort_by
+    assert filter.moves[0].resample.along_curve
 
 
 @pytest.mark.exactness

@@ -107,7 +107,7 @@ FILTERS: dict[str, Callable[[Any, int, int], mpfjax.Filter]] = {
     "mixture": mixture,
     "mixture, with_restarts": lambda model, n, m: mpfjax.with_restarts(mixture(model, n, m)),
     "mixture, with_initialisation": lambda model, n, m: mpfjax.with_alarm(
-        mpfjax.with_initialisation(mixture(model, n, m)), n
+        mpfjax.with_initialisation(mixture(model, n, m))
     ),
     "the same, with_restarts": lambda model, n, m: mpfjax.with_restarts(
         mpfjax.with_initialisation(mixture(model, n, m))

@@ -382,13 +382,8 @@ class AbstractProposal(Given):
 
 def propagation_of(moves: Moves) -> AbstractPropagationOfEach | None:
     """The first move that propagates particles each on its own, also within a wrapper."""
-    for move in moves:
-        if isinstance(move, AbstractPropagationOfEach):
-            return move
-        inner = None if isinstance(move, AbstractPropagation) else propagation_of(move.inner)
-        if inner is not None:
-            return inner
-    return None
+    chain = all_of(moves, within=False)
+    return next((move for move in chain if isinstance(move, AbstractPropagationOfEach)), None)
 
 
 def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: str) -> None:

@@ -7,15 +7,7 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import (
-    AbstractWrapper,
-    Moves,
-    Step,
-    as_moves,
-    in_turn,
-    is_missing,
-    name_of,
-)
+from mpfjax.moves.base import AbstractWrapper, Moves, Step, as_moves, in_turn, is_missing, name_of
 
 
 class Every(AbstractWrapper):

@@ -8,23 +8,16 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.noise import Noise
 from mpfjax.moves.base import AbstractMove, Step
 from mpfjax.moves.resampling.ancestors import draw_ancestors
-from mpfjax.moves.resampling.line import HILBERT, Line, sorted_order
-from mpfjax.operations.logarithms import (
-    default_float,
-    exp,
-    finite_or_zero,
-)
+from mpfjax.moves.resampling.line import Line, sorted_order
+from mpfjax.operations.logarithms import default_float, exp, finite_or_zero
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import stored, take, whole
 
 # A particle that the first observation tells nothing of keeps a quarter of its chance, so that no
 # weight is more than four times the mean.
 MOST_TRUST = 3 / 4
-# Draws of x_0 for each particle that are looked at together.
-MOST_AT_ONCE = 8
 # A prior is wide where fewer draws fit y_1, and a smaller part of all.
 FEWEST, LEAST_PART = 16, 1 / 64
 
@@ -45,16 +38,13 @@ class SelectInitial(AbstractMove):
     The filter's propagation draws and weights x_1.
 
     - `num_draws`: K.
-    - `noise`: of the draws of x_0, as in `Filter.initial_noise`. With "rqmc" they are ordered along
-      a Hilbert curve.
 
     It must be the first of the `initial_moves`, before those that regroup. Raises `ValueError` for
-    K < 1 and unknown noise, and in a filter without `Propagate` or `PropagateNested`. Use it if the
+    K < 1, and in a filter without `Propagate` or `PropagateNested`. Use it if the
     prior is somewhat broader than the likelihood; if it is far broader, use `with_initialisation`.
     """
 
-    num_draws: Count = eqx.field(static=True, default=4)
-    noise: Noise = eqx.field(static=True, default="independent")
+    num_draws: Count = eqx.field(static=True)
 
     approximate = False
     keeps_families = False
@@ -70,63 +60,32 @@ class SelectInitial(AbstractMove):
         """The mixture of the chosen x_0, in one component; without y_1 the one given."""
         if now.observation is None:
             return mixture
-        start = self._select(key, now, mixture.num_particles)
+        assert now.propagation is not None
+        key_drawn, key_look, key_kept = split(key, 3)
+        n, noise = mixture.num_particles, now.initial_noise
+        states = now.initial_law.sample_initial(key_drawn, self.num_draws * n, noise)
+        # Stored, so that x_1 is drawn on vectors, and once, not wherever its likelihood is used.
+        twice = single_component(states).repeat(2).map_slots(stored)
+        log_factors = stored(now.propagation(key_look, twice, now).log_weights).reshape(-1, 2).T
+        start = select(key_kept, states, log_factors, n, noise == "rqmc")
         return start.replace(num_components=mixture.num_components, memory=mixture.memory)
 
-    def num_fitting(self, log_weights: Float[np.ndarray, " n"]) -> float:
-        """The effective number of draws that y_1 speaks for, told from the weights of the chosen.
+    def is_wide(self, log_weights: Float[np.ndarray, " n"]) -> bool:
+        """Whether so few draws fit y_1 that chance decides the masses of modes.
 
-        It is (Σ ν)² / Σ ν² over the K N draws, of which N are chosen in proportion to ν.
+        Their effective number is (Σ ν)² / Σ ν² over the K N draws, told from the weights of the N
+        that were chosen in proportion to ν.
         """
         weights = np.exp(log_weights[log_weights > -np.inf].astype(float))
-        return float(self.num_draws * len(weights) / np.mean(1 / (len(weights) * weights)))
-
-    def is_wide(self, log_weights: Float[np.ndarray, " n"]) -> bool:
-        """Whether so few draws fit y_1 that chance decides the masses of modes."""
-        number, total = self.num_fitting(log_weights), self.num_draws * len(log_weights)
-        return bool(number < min(FEWEST, LEAST_PART * total))
-
-    def _select(self, key: Key[Array, ""], now: Step, n: int) -> ParticleMixture:
-        """N of K N draws; a few draws a particle at a time, so that memory has room for them."""
-        key_drawn, key_look, key_kept = split(key, 3)
-        at_once = next(k for k in range(MOST_AT_ONCE, 0, -1) if self.num_draws % k == 0)
-
-        def look(keys: Key[Array, "2"]) -> tuple[PyTree, Float[Array, "k 2"], Float[Array, ""]]:
-            states = now.initial_law.sample_initial(keys[0], at_once * n, self.noise)
-            log_factors, log_scale = two_looks(keys[1], now, states)
-            return states, log_factors.T, log_scale
-
-        def flat(leaf: Array) -> Array:
-            return leaf.reshape(-1, *leaf.shape[2:])
-
-        if (num_rounds := self.num_draws // at_once) == 1:
-            states, log_factors, _ = look(jnp.stack([key_drawn, key_look]))
-        else:
-            rounds = [jax.random.split(each, num_rounds) for each in (key_drawn, key_look)]
-            states, log_factors, log_scales = jax.lax.map(look, jnp.stack(rounds, axis=1))
-            log_factors += (log_scales - jnp.max(log_scales))[:, None, None]
-            states, log_factors = jax.tree.map(flat, (states, log_factors))
-        return select(key_kept, states, log_factors.T, n, self.noise == "rqmc")
+        number = self.num_draws * len(weights) / np.mean(1 / (len(weights) * weights))
+        return bool(number < min(FEWEST, LEAST_PART * self.num_draws * len(log_weights)))
 
 
 def require_propagation(now: Step, what: str) -> None:
     """Raise a `ValueError` for a filter none of whose moves draws x_t of each particle."""
     if now.propagation is None:
-        raise ValueError(
-            f"filter: {what} where Propagate or PropagateNested propagates, and none of its moves"
-            " is one"
-        )
-
-
-def two_looks(
-    key: Key[Array, ""], now: Step, states: PyTree
-) -> tuple[Float[Array, "2 n"], Float[Array, ""]]:
-    """The log-weights of two draws of x_t of each x_{t-1}, and their common scale."""
-    assert now.propagation is not None
-    # Stored, so that x_t is drawn on vectors, and once, not wherever its likelihood is used.
-    twice = single_component(states).repeat(2).map_slots(stored)
-    twice = now.propagation(key, twice, now)
-    return stored(twice.log_weights).reshape(-1, 2).T, twice.log_scale
+        which = "where Propagate or PropagateNested propagates, and none of its moves is one"
+        raise ValueError(f"filter: {what} {which}")
 
 
 def select(
@@ -144,7 +103,7 @@ def select(
         jax.lax.stop_gradient(selection_weights(log_factors, jnp.ones_like(log_factors[0])))
     )
     pool = single_component(states)
-    order = sorted_order(pool, pool.component_indicators, HILBERT) if in_order else None
+    order = sorted_order(pool, pool.component_indicators) if in_order else None
     weights = whole(trust if order is None else take(trust, order), 0.0)
     totals = jnp.sum(weights, keepdims=True)
     line = Line(pool.num_particles, weights, totals, jnp.zeros_like(totals), weights > 0, order)

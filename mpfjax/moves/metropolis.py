@@ -65,10 +65,8 @@ class AbstractMetropolis(AbstractMarkovMove):
     needs_parents = True
     """the target of x_t is given x_{t-1}."""
 
-    @property
-    def biases_score(self) -> bool:
-        """Whether derivatives do not see which moves are accepted."""
-        return self.gradient == "none"
+    # Derivatives do not see which moves are accepted.
+    biases_score = property(lambda self: self.gradient == "none")
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a model without `log_transition`."""

@@ -119,13 +119,6 @@ class Positions(NamedTuple):
     whole: Int[Array, "*shape"]
     fraction: Float[Array, "*shape"]
 
-    def shift(self, distance: Float[Array, "..."]) -> "Positions":
-        """The positions so many slots and parts of one further on."""
-        turns = jnp.floor(distance)
-        fraction = self.fraction + (distance - turns)
-        carried = jnp.floor(fraction)
-        return Positions(self.whole + (turns + carried).astype(jnp.int32), fraction - carried)
-
     def in_units(self, num_bits: int) -> Int[Array, "*shape"]:
         """In units of 2^-num_bits slots, rounded down."""
         return (self.whole << num_bits) + (self.fraction * 2.0**num_bits).astype(jnp.int32)

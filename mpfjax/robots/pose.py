@@ -137,7 +137,7 @@ def follow(
         mixture, info = filter.step(key_step, mixture, scan, inputs=step)
         evidence = info.log_evidence_against_start
         if evidence is None:
-            raise ValueError("filter: it has no alarm; write with_alarm(filter, 1000)")
+            raise ValueError("filter: it has no alarm; write with_alarm(filter)")
         log_odds = _next_log_odds(log_odds, float(evidence))
         summary = _summary(mixture, jnp.asarray(radius))
         pose, covariance, share, means, weights = map(np.asarray, summary)

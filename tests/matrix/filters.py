@@ -85,7 +85,7 @@ TRANSFORMS: dict[str, Callable[[Filter], Filter]] = {
     "selected start": mpfjax.with_initial_selection,
     "start": lambda filter: mpfjax.with_initialisation(filter, 2),
     "restarts": lambda filter: mpfjax.with_restarts(filter, num_observations=2),
-    "alarm": lambda filter: mpfjax.with_alarm(filter, 16),
+    "alarm": mpfjax.with_alarm,
     "families": lambda filter: mpfjax.with_eve_indices(
         mpfjax.with_resampling(filter, Resample("multinomial"))
     ),

@@ -12,12 +12,7 @@ import scipy.stats
 from scipy.stats import qmc
 
 from mpfjax.models.noise import draw_noise, stratified_uniform
-from mpfjax.moves.resampling.sorting import (
-    bits_per_dimension,
-    hilbert_index,
-    order_by_key,
-    sortable_bits,
-)
+from mpfjax.moves.resampling.sorting import BITS, hilbert_index, order_by_key, sortable_bits
 from mpfjax.operations.random import direction_numbers, scramble, scrambled_directions, sobol_points
 
 # As one program each: to compile operations one by one takes longer.
@@ -28,7 +23,7 @@ FLOAT = np.dtype("float32")
 KEYS = jax.random.split(jax.random.key(7), 4000)
 
 
-@pytest.mark.parametrize(("d", "num_bits"), [(1, 4), (2, 5), (3, 3), (5, 2)])
+@pytest.mark.parametrize(("d", "num_bits"), [(2, 5), (3, 3), (5, 2)])
 def test_a_hilbert_curve_visits_every_cell_once_and_goes_to_a_neighbour(d, num_bits):
     cells = np.array(list(itertools.product(range(2**num_bits), repeat=d)), np.uint32).T
     index = np.asarray(hilbert_index(jnp.asarray(cells), num_bits))
@@ -40,7 +35,7 @@ def test_a_hilbert_curve_visits_every_cell_once_and_goes_to_a_neighbour(d, num_b
 def test_a_hilbert_index_of_all_its_bits_goes_on_where_the_coarse_one_is():
     """Of cells within cells, the curve leaves one only when it has been everywhere in it."""
     d = 3
-    num_bits = bits_per_dimension(d)
+    num_bits = BITS // d
     cells = np.random.default_rng(0).integers(0, 2**num_bits, (d, 500)).astype(np.uint32)
     fine = np.asarray(hilbert_index(jnp.asarray(cells), num_bits))
     # The first axis of a coarser curve is another one for each number of bits but every d-th.
@@ -54,10 +49,9 @@ def test_the_order_by_key_is_that_of_a_stable_sort(n, num_segments):
     values = rng.choice([-np.inf, -1.0, -0.0, 0.0, 1e-3, 2.5, np.inf, np.nan], n).astype(FLOAT)
     values = np.where(rng.random(n) < 0.5, values, rng.normal(size=n).astype(FLOAT))
     segments = rng.integers(0, num_segments, n)
-    for column in (values, rng.integers(-5, 5, n)):
-        keys = sortable_bits(jnp.asarray(column))
-        order = order_by_key(keys, jnp.asarray(segments, jnp.int32), num_segments)
-        np.testing.assert_array_equal(order, np.lexsort((column, segments)))
+    keys = sortable_bits(jnp.asarray(values))
+    order = order_by_key(keys, jnp.asarray(segments, jnp.int32), num_segments)
+    np.testing.assert_array_equal(order, np.lexsort((values, segments)))
 
 
 def test_sobol_points_are_those_of_scipy():

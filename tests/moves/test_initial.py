@@ -67,22 +67,6 @@ def test_the_chosen_particles_represent_the_prior(runs):
         assert_unbiased(np.sum(weights * np.asarray(function), axis=1), mean)
 
 
-@pytest.mark.weekly
-def test_particles_descend_from_those_of_the_run():
-    """Without noise in the dynamics x_1 is x_0 of its ancestor, where the run says it was."""
-    model = mpfjax.LinearGaussianModel(
-        np.eye(2), 1e-12 * np.eye(2), np.eye(2), np.eye(2), np.zeros(2), np.eye(2)
-    )
-    filter = mpfjax.with_quasi_monte_carlo(mpfjax.mixture_particle_filter(model, 40, 3))
-    run = mpfjax.run_filter(KEY, filter, np.ones((2, 2), np.float32))
-    first = jax.tree.map(lambda leaf: leaf[0], run.collected)
-    assert len(np.unique(first.ancestor_indices)) == 40  # no particle of x_0 is resampled
-    parents = np.asarray(run.initial.particles)[first.ancestor_indices]
-    np.testing.assert_allclose(first.particles, parents, atol=1e-4)
-    assert not np.any(run.resampled[0])
-    assert np.any(run.resampled[1])
-
-
 @pytest.mark.exactness
 def test_without_an_observation_it_does_nothing():
     gap = OBSERVATIONS.copy()
@@ -113,14 +97,6 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
     log_z = -0.5 * (seen @ np.linalg.solve(covariance, seen) + np.linalg.slogdet(covariance)[1])
     log_z -= np.log(2 * np.pi)
     assert_unbiased(ratios_to(log_z, found))
-
-
-@pytest.mark.exactness
-def test_on_islands_the_masses_of_their_choices_count():
-    def run(key):
-        return mpfjax.run_islands(key, make(8, 50), OBSERVATIONS, nothing, num_islands=2)
-
-    assert_unbiased(ratios_to(exact(), jax.jit(jax.vmap(run))(jax.random.split(KEY, 300))))
 
 
 @pytest.mark.exactness

@@ -11,8 +11,8 @@ import pytest
 import mpfjax
 from mpfjax import Filter, GroupBy, KMeans, PropagateRegimes, RegimeProposal, Resample, Step
 from mpfjax.exact import kalman_filter, switching_filter
+from mpfjax.moves.propagation.marginalised import children
 from mpfjax.moves.propagation.propagate import Predict, Reweight
-from mpfjax.moves.propagation.regimes import children
 from tests.marking import quick_of, weekly
 from tests.precision import float64
 from tests.switching import MODEL, NUM_REGIMES, OBSERVATIONS, TRANSITIONS, moments, regimes, truth
@@ -276,37 +276,3 @@ def test_more_slots_than_children_stay_empty():
         np.testing.assert_allclose(
             info.log_likelihood_increment, exact.log_likelihood_increments[step], rtol=1e-4
         )
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize("kind", ["stop", *weekly(["stop, optimal proposal", "all children"])])
-def test_derivatives_of_the_evidence_are_unbiased(kind):
-    """E[∇Ẑ] = ∇Z, for a parameter of the law of z and one of the noise of x."""
-
-    def model_of(parameters):
-        stays, scale = parameters
-        matrix = TRANSITIONS + stays * jnp.array([[1.0, -1, 0], [0, 1, -1], [-1, 0, 1]])
-        return eqx.tree_at(lambda m: (m.transition_matrix, m.Q), MODEL, (matrix, scale * MODEL.Q))
-
-    def run_of(parameters, key):
-        model = model_of(parameters)
-        if kind == "all children":
-            filter = Filter(model, [PropagateRegimes()], 10)
-        else:
-            proposal = RegimeProposal() if "proposal" in kind else None
-            filter = mpfjax.particle_filter(model, 10, proposal=proposal, gradient="stop")
-        run = mpfjax.run_filter(key, filter, OBSERVATIONS[:4], lambda mixture: None)
-        return run.log_marginal_likelihood
-
-    at = (jnp.array(0.0), jnp.array(1.0))
-    exact, slope = jax.value_and_grad(
-        lambda p: switching_filter(model_of(p), OBSERVATIONS[:4]).log_marginal_likelihood
-    )(at)
-    keys = jax.random.split(jax.random.key(3), 4000)
-    logs, slopes = jax.jit(jax.vmap(jax.value_and_grad(run_of), (None, 0)))(at, keys)
-    ratios = np.exp(np.asarray(logs - exact))
-    for found, expected in zip(slopes, slope, strict=True):
-        values = ratios * np.asarray(found)
-        error = values.std() / np.sqrt(len(keys))
-        assert error < 0.3 * abs(float(expected))
-        assert abs(values.mean() - float(expected)) < 4 * error

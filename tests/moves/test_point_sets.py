@@ -106,26 +106,25 @@ def test_without_an_observation_the_noise_is_a_point_set_as_well():
 
 
 @eqx.filter_jit
-def resampled(mixture, sort_by):
-    return Resample(sort_by=sort_by)(KEY, mixture)
+def resampled(mixture, along_curve=True):
+    return Resample(along_curve=along_curve)(KEY, mixture)
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize("sort_by", ["hilbert", lambda x: x[:, 0] ** 3])
-def test_particles_of_a_component_stand_near_their_neighbours(sort_by):
+@pytest.mark.parametrize("dimension", [1, 2])
+def test_particles_of_a_component_stand_near_their_neighbours(dimension):
     """The way through all particles in turn is far shorter than in the order that they had."""
     rng = np.random.default_rng(0)
-    states, labels = rng.normal(size=(400, 2)), rng.integers(0, 3, 400)
+    states, labels = rng.normal(size=(400, dimension)), rng.integers(0, 3, 400)
     states += 50 * labels[:, None]
     mixture = make_mixture(states, np.zeros(400), labels, 3)
 
     def way(mixture):
-        x = np.asarray(mixture.particles)
-        x = x[:, :1] if callable(sort_by) else x
         within = np.diff(mixture.component_indicators) == 0
-        return np.linalg.norm(np.diff(x, axis=0), axis=1)[within].sum()
+        steps = np.diff(np.asarray(mixture.particles), axis=0)
+        return np.linalg.norm(steps, axis=1)[within].sum()
 
-    plain, sorted_ = (resampled(mixture, by) for by in (None, sort_by))
+    plain, sorted_ = resampled(mixture, False), resampled(mixture)
     assert way(sorted_) < 0.3 * way(plain)
     assert (np.diff(sorted_.component_indicators) >= 0).all()
 
@@ -138,7 +137,7 @@ def test_many_coordinates_are_sorted_along_the_first_principal_ones():
     states, log_weights = states * 10.0 ** np.arange(-12, 13), np.zeros(400)
     states[7], log_weights[7] = np.nan, -np.inf
     mixture = make_mixture(states, log_weights, np.zeros(400, int), 1)
-    ancestors = np.asarray(resampled(mixture, "hilbert").ancestor_indices)
+    ancestors = np.asarray(resampled(mixture).ancestor_indices)
     assert 7 not in ancestors
 
     def way(order):
@@ -152,7 +151,7 @@ def test_standardised_coordinates_make_units_immaterial():
     rng = np.random.default_rng(1)
     states, labels = rng.normal(size=(200, 3)), rng.integers(0, 6, 200)
     ancestors = [
-        resampled(make_mixture(states * unit, np.zeros(200), labels, 6), "hilbert").ancestor_indices
+        resampled(make_mixture(states * unit, np.zeros(200), labels, 6)).ancestor_indices
         for unit in (1.0, np.array([2.0**-9, 1.0, 2.0**12]))
     ]
     np.testing.assert_array_equal(*ancestors)
@@ -165,7 +164,7 @@ def test_components_of_one_particle_and_all_particles_at_one_point():
     labels = np.array([0, 1, 2, 3, 4, 4, 4, 4, 4, 4])
     for states in (np.ones((10, 2)), np.arange(20.0).reshape(10, 2)):
         mixture = make_mixture(states, np.zeros(10), labels, 5)
-        moved = propagate(KEY, resampled(mixture, "hilbert"), now)
+        moved = propagate(KEY, resampled(mixture), now)
         assert np.isfinite(moved.particles).all()
         assert len(np.unique(moved.particles[:, 0])) == 10
 

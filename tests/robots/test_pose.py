@@ -48,7 +48,7 @@ def test_a_robot_that_is_carried_away_is_lost():
     steps = np.tile(robots.odometry_steps(poses), (2, 1))
     places = jnp.asarray(np.concatenate([poses[1:], elsewhere[1:]]), jnp.float32)
     pairs = list(zip(steps, np.asarray(GRID.ranges(places, ANGLES, MOST)), strict=True))
-    filter = mpfjax.with_alarm(mpfjax.particle_filter(model, 3000), 500)
+    filter = mpfjax.with_alarm(mpfjax.particle_filter(model, 3000))
     estimates = list(robots.follow(jax.random.key(0), filter, pairs, radius=0.5))
     assert [len(estimates), estimates[7].lost < 0.3, estimates[-1].lost > 0.9] == [16, True, True]
     here = estimates[7]

@@ -32,7 +32,7 @@ CASES = {
     ),
     "many components, sorted, of fixed number": (
         chain(
-            Resample("stratified", particles_per_component=2, sort_by=lambda x: -x),
+            Resample("stratified", particles_per_component=2, along_curve=True),
             Predict(), Reweight(), RandomPartition(), n=11, m=5,
         ),
         False,
@@ -136,7 +136,7 @@ def test_one_particle_none_seen_and_no_log_transition():
 )
 def test_initial_moves_that_may_change_the_trajectory_are_refused(move):
     plain = mpfjax.particle_filter(Walled(), 6, scheme="multinomial")
-    others = mpfjax.with_eve_indices(plain), mpfjax.with_alarm(plain, 4)
+    others = mpfjax.with_eve_indices(plain), mpfjax.with_alarm(plain)
     for filter in (plain.replace(initial_moves=[move]), *others):
         with pytest.raises(ValueError, match="cannot keep a trajectory"):
             conditional_filter(jax.random.key(0), filter, ONES, np.zeros(4, np.float32))

@@ -1,7 +1,6 @@
-"""The contracts of every chain of moves in the registry.
+"""The contracts of every chain of moves in the registry, on a model of two modes.
 
-Two programs are compiled for each chain and shared by the tests: thousands of runs of the chain
-at once, and its single step.
+What steps, constants in the likelihood and impossible observations do is asked in the matrix.
 """
 
 from functools import cache
@@ -57,7 +56,7 @@ def joint_truth(chain):
 
 def moments(mixture):
     states = mixture.particles.reshape(mixture.num_particles, -1)
-    return mixture.expectation(states), mixture.expectation(states**2), mixture.particles
+    return mixture.expectation(states), mixture.expectation(states**2)
 
 
 @cache
@@ -89,7 +88,7 @@ def test_evidence_and_moments_are_unbiased(chain):
     run, exact = runs(chain), joint_truth(chain)
     log_evidence = np.cumsum(run.log_likelihood_increments, axis=1)
     ratios = np.exp(log_evidence - exact.log_evidence)
-    first, second, _ = run.collected
+    first, second = run.collected
     assert_unbiased(ratios, loosest=0.03)
     assert_unbiased(ratios[..., None] * first, exact.first)
     assert_unbiased(ratios[..., None] * second, exact.second)
@@ -114,64 +113,6 @@ def test_what_is_approximate_is_declared():
 @over_chains
 class TestOnline:
     """The chain's single step, on the tricky quadratic model."""
-
-    @pytest.mark.exactness
-    def test_step_by_step_equals_the_scan_and_a_loop_equals_vmap(self, chain):
-        run, filter = runs(chain), chain_filter(chain)
-        k = 6  # in which no particle lies within rounding of the edge between two offspring
-        key_initial, key_steps = jax.random.split(jax.random.split(jax.random.key(3), NUM_RUNS)[k])
-        mixture = filter.init(key_initial, OBSERVATIONS[0])
-        for t, key in enumerate(jax.random.split(key_steps, len(OBSERVATIONS))):
-            mixture, info = filter.step(key, mixture, OBSERVATIONS[t])
-            increment = run.log_likelihood_increments[k, t]
-            np.testing.assert_allclose(info.log_likelihood_increment, increment, rtol=1e-3)
-            drawn = run.collected[2][k, t]
-            np.testing.assert_allclose(mixture.particles, drawn, rtol=1e-4, atol=1e-4)
-            np.testing.assert_array_equal(info.resampled, run.resampled[k, t])
-        for name in ("component_indicators", "ancestor_indices"):
-            np.testing.assert_array_equal(getattr(mixture, name), getattr(run.final, name)[k])
-
-    def test_a_step_of_zero_likelihood_is_flagged_and_the_filter_goes_on(self, chain):
-        filter = chain_filter(chain)
-        mixture = started(chain)
-        blinded, info = filter.step(jax.random.key(6), mixture, observed(BLINDED))
-        assert float(info.log_likelihood_increment) == -np.inf
-        assert bool(info.degenerate)
-        np.testing.assert_allclose(float(blinded.mixture_weights.sum()), 1.0, rtol=1e-5)
-        assert np.isfinite(blinded.particles).all()
-        after, info = filter.step(jax.random.key(7), blinded, OBSERVATIONS[0])
-        assert np.isfinite(info.log_likelihood_increment)
-        assert not bool(info.degenerate)
-        assert np.isfinite(after.mean()).all()
-
-    @pytest.mark.parametrize("constant", [1e3, -1e30])
-    def test_a_constant_moves_the_evidence_and_nothing_else(self, chain, constant):
-        """Added to every log-likelihood, of any size that the type holds.
-
-        What it leaves of the likelihoods' own digits is the same in both filters.
-        """
-        constant = np.float32(constant)
-        with_it, without = (
-            CHAINS[chain](TrickyQuadraticModel(0.3, 0.5, constant=constant, taken_off=taken_off))
-            for taken_off in (np.float32(0), constant)
-        )
-        mixture = expected = started(chain)
-        copies = getattr(with_it.model, "num_objects", 1)
-        for t, observation in enumerate(OBSERVATIONS[1:3]):
-            mixture, info = with_it.step(jax.random.key(t), mixture, observation)
-            expected, plain = without.step(jax.random.key(t), expected, observation)
-            assert float(mixture.weights.sum()) == pytest.approx(1, rel=1e-5)
-            increment = copies * constant + plain.log_likelihood_increment
-            np.testing.assert_allclose(
-                info.log_likelihood_increment, increment, rtol=1e-6, atol=1e-5
-            )
-            np.testing.assert_array_equal(info.resampled, plain.resampled)
-            np.testing.assert_allclose(info.mixture_weights, plain.mixture_weights, atol=1e-5)
-            np.testing.assert_allclose(mixture.weights, expected.weights, rtol=1e-4, atol=1e-6)
-            np.testing.assert_allclose(mixture.particles, expected.particles, atol=1e-5)
-            np.testing.assert_array_equal(mixture.ancestor_indices, expected.ancestor_indices)
-            labels = mixture.component_indicators, expected.component_indicators
-            np.testing.assert_array_equal(*labels)
 
     def test_a_number_that_is_not_finite_is_an_error(self, chain):
         filter = chain_filter(chain)
@@ -201,12 +142,3 @@ def started(chain):
     filter = chain_filter(chain)
     mixture = filter.init(jax.random.key(4))
     return filter.step(jax.random.key(5), mixture, OBSERVATIONS[0])[0]
-
-
-@pytest.mark.exactness
-def test_a_missing_observation_moves_the_particles_and_leaves_the_masses():
-    filter, mixture = chain_filter("mpf"), started("mpf")
-    predicted, info = filter.predict(jax.random.key(6), mixture)
-    assert float(info.log_likelihood_increment) == 0.0
-    assert not np.array_equal(predicted.particles, mixture.particles)
-    np.testing.assert_allclose(predicted.mixture_weights, mixture.mixture_weights, rtol=1e-5)

@@ -111,18 +111,6 @@ def test_slots_are_asked_for_by_mass_times_the_root_of_the_variance():
     np.testing.assert_allclose(asked / asked.sum(), expected, rtol=0.01)
 
 
-@pytest.mark.exactness
-def test_the_total_of_islands_is_the_mean_over_all_their_particles():
-    """Of one step without resampling, from the likelihoods of the particles themselves."""
-    filter = mpfjax.Filter(MODEL, [Propagate()], 12)
-    run = mpfjax.run_islands(jax.random.key(0), filter, jnp.array([0.7]), num_islands=4)
-    log_likelihoods = NORMAL(0.7, np.asarray(run.final.particles, float), 0.5)
-    expected = np.logaddexp.reduce(log_likelihoods) - np.log(48)
-    np.testing.assert_allclose(run.log_marginal_likelihood, expected, rtol=1e-5)
-    weights = np.exp(log_likelihoods - np.logaddexp.reduce(log_likelihoods))
-    np.testing.assert_allclose(np.exp(run.final.log_weights), weights, rtol=1e-4)
-
-
 class OfTheMean(mpfjax.AbstractStateSpaceModel):
     """y_t = θ + N(0, 1), whatever the state: every filter's evidence is exact."""
 

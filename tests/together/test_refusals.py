@@ -97,10 +97,10 @@ GOOD = {
             PropagateInClusters),
     **alike({"particles_per_component": 2}, Resample, mpfjax.GaussianRegeneration),
     **alike({"filter": FILTER}, mpfjax.with_lookahead, mpfjax.with_quasi_monte_carlo,
-            mpfjax.with_score_gradient, mpfjax.with_initialisation, mpfjax.with_restarts),
+            mpfjax.with_score_gradient, mpfjax.with_initialisation, mpfjax.with_restarts,
+            mpfjax.with_alarm),
     **alike({"filter": FILTER, "num_draws": 2}, mpfjax.with_initial_selection,
             mpfjax.with_proposals_per_particle),
-    mpfjax.with_alarm: {"filter": FILTER, "num_particles": 2},
     **alike({"model": MODEL, "num_particles": 4}, mpfjax.particle_filter,
             mpfjax.gaussian_particle_filter),
     **alike({"model": MODEL, "num_particles": 4, "max_components": 2},
@@ -370,9 +370,6 @@ REFUSED = (
     ),
     # observations
     (r"observations: shapes .* jnp.asarray\(observations\)", lambda: run(FILTER, [0.0, 1.0])),
-    ("observations: NaN or infinite at index 1", lambda: run(FILTER, np.array([0.0, NAN, 1.0]))),
-    ("observations: .* is no array of real numbers", lambda: run(FILTER, np.array([0.0, 1j]))),
-    (r"observations: 1e\+300 is more than float32", lambda: run(FILTER, np.array([0.0, 1e300]))),
     (r"observation: shape \(2,\)", lambda: run(FILTER, jnp.zeros((3, 2)))),
     # what a model's methods return
     ("model: DriftOfOne.sample_initial.*per_particle",

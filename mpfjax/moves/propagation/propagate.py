@@ -99,7 +99,7 @@ class Propagate(Draw, AbstractPropagationOfEach):
       slots of each component. The distribution of every single particle does not change, so Ẑ
       remains unbiased. The noise is a randomised point set over slot and noise, a Sobol set for
       noise of two dimensions or more (L'Ecuyer, Lécot and Tuffin 2008; Gerber and Chopin 2015). The
-      gain is largest if a `Resample(sort_by="hilbert")` has ordered the particles in the same step.
+      gain is largest if a `Resample(along_curve=True)` has ordered the particles in the same step.
       If none has, as without an observation, the points are assigned at random, and errors are
       about as large as with independent noise. Use it if mixture weights and likelihoods must be
       accurate.

@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Callable
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,12 +11,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key
 
-from mpfjax.arrays import (
-    POSITIVE,
-    to_array,
-)
+from mpfjax.arrays import POSITIVE, to_array
 from mpfjax.checks import Count, Positive, checked
 from mpfjax.models.base import require
+from mpfjax.models.noise import noise_dtype
 from mpfjax.moves.base import AbstractProposal, Step
 from mpfjax.operations.matrices import cholesky, solve_lower
 from mpfjax.operations.random import normal
@@ -36,20 +34,25 @@ class _Gaussian(NamedTuple):
         return -0.5 * jnp.sum(noise**2, axis=1) - log_unit - self.log_volumes
 
 
-class _GaussianProposal(AbstractProposal):
+class ProposalOfNoise(AbstractProposal):
+    """A proposal that has `propose_from_noise`, by which it draws."""
+
+    def propose(
+        self, key: Key[Array, ""], now: Step, previous_states: Any
+    ) -> tuple[Any, Float[Array, " n"]]:
+        """x_t of every particle, and log q of each."""
+        number = jax.tree.leaves(previous_states)[0].shape[0]
+        shape = (number, self.noise_dimension(previous_states))
+        noise = normal(key, shape, noise_dtype(previous_states))
+        return self.propose_from_noise(noise, now, previous_states)
+
+
+class _GaussianProposal(ProposalOfNoise):
     """A proposal whose draw is made of as many normal numbers as the state has."""
 
     @abc.abstractmethod
     def _law(self, now: Step, previous_states: Float[Array, "n ..."]) -> _Gaussian:
         """q of every particle."""
-
-    def propose(
-        self, key: Key[Array, ""], now: Step, previous_states: Float[Array, "n ..."]
-    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
-        """x_t from the Gaussian of every particle, and its log density."""
-        shape = (previous_states.shape[0], self.noise_dimension(previous_states))
-        noise = normal(key, shape, previous_states.dtype)
-        return self.propose_from_noise(noise, now, previous_states)
 
     def noise_dimension(self, previous_states: Float[Array, "n ..."]) -> int:
         """d."""

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -32,13 +31,12 @@ def allocate_slots(
     due: Bool[Array, " m"],
     num_slots: int | Int[Array, ""],
     particles_per_component: int | None,
-    demands: Float[Array, " m"] | None = None,
+    demands: Float[Array, " m"],
 ) -> Int[Array, " m"]:
     """How many slots each component gets.
 
-    Components that are not due keep theirs, `counts`. The others share the rest of the slots
-    equally; or, given `demands`, in proportion to these with at least one each; or get
-    `particles_per_component` each.
+    Components that are not due keep theirs, `counts`. The others share the rest of the slots in
+    proportion to `demands` with at least one each; or get `particles_per_component` each.
     """
     if particles_per_component is not None:
         share = jnp.minimum(jnp.asarray(particles_per_component, jnp.int32), num_slots)
@@ -47,13 +45,8 @@ def allocate_slots(
         return jnp.where(due, num_slots, counts)
     pool = num_slots - jnp.sum(counts, dtype=jnp.int32)
     sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
-    if demands is None:
-        # One more for the first ones if it does not divide evenly.
-        share = jax.lax.div(pool, sharers)  # neither is negative
-        share += (jnp.cumsum(due, dtype=jnp.int32) - 1 < pool - share * sharers).astype(jnp.int32)
-    else:
-        first = jnp.minimum(pool // sharers, 1)
-        share = first + _in_proportion(pool - first * sharers, due, demands)
+    first = jnp.minimum(pool // sharers, 1)
+    share = first + _in_proportion(pool - first * sharers, due, demands)
     return stored(jnp.where(due, share, counts))
 
 

@@ -5,12 +5,8 @@ line, as long as its expected number of offspring k_m w_i, and the scheme places
 unit interval of each slot and counts those before the particle's. To add a scheme, write such a
 function and name it in `SCHEMES`.
 
-A particle may be retained, as in conditional SMC: it then has at least one offspring. The offspring
-of all have their ordinary distribution, given that one slot of its component, each with equal
-probability, has the retained particle as its parent. So the numbers of offspring have their
-ordinary distribution weighted by the number of the retained particle, and its slot is any of its
-offspring. Points have this distribution if one of them is drawn uniformly from the particle's own
-interval.
+A particle may be retained, as in conditional SMC, if the scheme is multinomial: one slot of its
+component, each with equal probability, has it as its parent, and the others are drawn as usual.
 """
 
 from collections.abc import Callable
@@ -35,14 +31,6 @@ class Ancestors(NamedTuple):
     reference: Int[Array, ""] | None  # the slot of the offspring that was to be kept
 
 
-class ReferenceParticle(NamedTuple):
-    """A particle that has one offspring at least."""
-
-    place: Int[Array, ""]
-    component: Int[Array, ""]
-    shares: Float[Array, "2"]  # independent uniform numbers, for its point and its slot
-
-
 class Dealt(NamedTuple):
     """What a scheme draws from: a line, and the slots that its components have."""
 
@@ -51,7 +39,6 @@ class Dealt(NamedTuple):
     slots: Slots
     expected: Float[Array, " p"]  # the expected number of offspring of each particle
     before: Positions  # the start of its interval
-    reference: ReferenceParticle | None
 
 
 def draw_ancestors(
@@ -67,40 +54,34 @@ def draw_ancestors(
     """The parents of the slots: `targets` of each component, side by side, the empty ones last.
 
     Where a component is not `due`, its particles stay as they are; None resamples every one. The
-    particle `keep` has an offspring whatever is drawn; it must be drawn from, or stay, in `line`.
+    particle `keep` has an offspring whatever is drawn, by the multinomial scheme; it must be drawn
+    from, or stay, in `line`.
     """
     slots = place_slots(targets, num_slots)
     shares = targets.astype(line.totals.dtype) / jnp.where(line.totals > 0, line.totals, 1.0)
     expected = line.weights * line.of_places(shares)
     before, is_inside = line.positions(expected, targets, slots.firsts, num_slots)
-    reference = None
     if keep is not None:
         key, key_kept = split(key, 2)
-        place, component = keep, jnp.zeros((), jnp.int32)
-        if line.order is not None and line.labels is not None:
-            place = jnp.argmax(line.order == keep).astype(jnp.int32)
-            component = line.components[place]
-        reference = ReferenceParticle(place, component, uniform(key_kept, (2,), expected.dtype))
-    starts = SCHEMES[scheme](key, Dealt(line, targets, slots, expected, before, reference))
+    starts = SCHEMES[scheme](key, Dealt(line, targets, slots, expected, before))
     # Rounding must not give a slot to particles after the last weight, nor cross a border.
     num_filled = jnp.sum(targets, dtype=jnp.int32)
     starts = jnp.where(is_inside, jnp.minimum(starts, num_filled), num_filled)
-    firsts, lasts = line.extents(drawn=True)
-    firsts, lasts = spread(firsts, slots.components), spread(lasts, slots.components)
+    first_places, last_places = line.extents(drawn=True)
+    firsts, lasts = spread(first_places, slots.components), spread(last_places, slots.components)
     parents = jnp.clip(count_starts(starts, num_slots), firsts, lasts)
     if due is not None:
         parents = jnp.where(spread(due, slots.components), parents, firsts + slots.ranks)
     slot = None
-    if reference is not None:
-        # Rounding may leave it without any: it then takes the slot where its interval starts.
-        is_own = slots.filled & (parents == reference.place)
-        number = jnp.sum(is_own, dtype=jnp.int32)
-        choice = (reference.shares[1] * number.astype(expected.dtype)).astype(jnp.int32)
-        slot = jnp.argmax(is_own).astype(jnp.int32) + jnp.minimum(choice, number - 1)
-        slot = jnp.where(number > 0, slot, starts[reference.place])
-        first, most = slots.firsts[reference.component], targets[reference.component]
-        slot = jnp.clip(slot, first, first + jnp.maximum(most, 1) - 1)
-        parents = parents.at[slot].set(reference.place)
+    if keep is not None:
+        place, component = line.place_of(keep)
+        most = jnp.maximum(targets[component] - 1, 0)
+        share = uniform(key_kept, (), expected.dtype) * targets[component].astype(expected.dtype)
+        rank = share.astype(jnp.int32)
+        if due is not None:
+            rank = jnp.where(due[component], rank, place - first_places[component])
+        slot = slots.firsts[component] + jnp.clip(rank, 0, most)
+        parents = parents.at[slot].set(place)
     particles = jnp.clip(parents, 0, line.num_particles - 1)
     if line.order is not None:
         particles = take(line.order, stored(particles))
@@ -109,28 +90,15 @@ def draw_ancestors(
 
 def systematic(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
     shift = stored(uniform(key, dealt.targets.shape, dealt.expected.dtype))
-    if dealt.reference is not None:
-        shift = shift.at[dealt.reference.component].set(_reference_point(dealt).fraction)
     comes_before = dealt.line.of_places(shift) < dealt.before.fraction
     return dealt.before.whole + comes_before.astype(jnp.int32)
 
 
 def stratified(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
     shift = uniform(key, dealt.slots.components.shape, dealt.expected.dtype)
-    if dealt.reference is not None:
-        point = _reference_point(dealt)
-        shift = shift.at[point.whole].set(point.fraction, mode="drop")
     slot = jnp.clip(dealt.before.whole, 0, shift.shape[0] - 1)
     comes_before = take(shift, slot) < dealt.before.fraction
     return dealt.before.whole + comes_before.astype(jnp.int32)
-
-
-def _reference_point(dealt: Dealt) -> Positions:
-    """A point drawn uniformly from the interval of the kept particle."""
-    assert dealt.reference is not None
-    before, place = dealt.before, dealt.reference.place
-    start = Positions(before.whole[place], before.fraction[place])
-    return start.shift(dealt.reference.shares[0] * dealt.expected[place])
 
 
 def multinomial(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
@@ -139,9 +107,6 @@ def multinomial(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
     num_bits = unit_bits(num_slots)
     lengths = jnp.maximum(spread(dealt.targets, slots.components), 1) << num_bits
     points = below(key, lengths) + (spread(slots.firsts, slots.components) << num_bits)
-    if dealt.reference is not None:
-        point = _reference_point(dealt).in_units(num_bits)
-        points = points.at[slots.firsts[dealt.reference.component]].set(point, mode="drop")
     parents = jnp.searchsorted(dealt.before.in_units(num_bits), points, side="right") - 1
     # The points of empty slots are in no particle's interval.
     places = jnp.where(slots.filled, jnp.maximum(parents, 0).astype(jnp.int32), num_places)

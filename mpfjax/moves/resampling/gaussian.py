@@ -57,14 +57,8 @@ class GaussianRegeneration(AbstractResampling):
     approximate = True
     """each component is replaced by a Gaussian."""
 
-    @property
-    def biases_score(self) -> bool:
-        """Whether a part of the state is copied, which derivatives ignore.
-
-        The draws themselves are functions of moments, which are differentiated.
-        """
-        return self.where is not None
-
+    # The draws are functions of moments, which are differentiated; a part that is copied is not.
+    biases_score = property(lambda self: self.where is not None)
     keeps_parents = False
     """a draw of a Gaussian comes from all particles of its component."""
 
@@ -78,7 +72,8 @@ class GaussianRegeneration(AbstractResampling):
         """The mixture with every active component redrawn."""
         key_noise, key_rest = split(key, 2)
         vacated = self._resample.resample(key_rest, mixture)
-        states = self._draw(key_noise, self._redrawn(mixture.particles), mixture, vacated)
+        chosen = mixture.particles if self.where is None else self.where(mixture.particles)
+        states = self._draw(key_noise, chosen, mixture, vacated)
         if self.where is not None:
             states = eqx.tree_at(self.where, vacated.particles, states)
         redrawn = vacated.replace(particles=states, ancestor_indices=no_ancestors(vacated))
@@ -88,11 +83,7 @@ class GaussianRegeneration(AbstractResampling):
         # The next noise is a point set over its slots.
         labels = mixture.component_indicators
         labels = jnp.where(mixture.occupied, labels, mixture.num_components)
-
-        def place(particles: PyTree) -> Array:
-            return flatten_states(self._redrawn(particles))
-
-        return mixture.at(sorted_order(mixture, labels, place)).with_order(True)
+        return mixture.at(sorted_order(mixture, labels)).with_order(True)
 
     @property
     def _resample(self) -> Resample:
@@ -101,10 +92,6 @@ class GaussianRegeneration(AbstractResampling):
             particles_per_component=self.particles_per_component,
             allocation="equal" if self.where is None else "variance",
         )
-
-    def _redrawn(self, particles: PyTree) -> PyTree:
-        """The part of the state that is redrawn."""
-        return particles if self.where is None else self.where(particles)
 
     def _correct(
         self, covariances: Float[Array, "m d d"], mixture: ParticleMixture

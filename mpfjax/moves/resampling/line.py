@@ -4,52 +4,30 @@ The particles are arranged on a line, each with an interval as long as its expec
 offspring. Every slot has a point on the line, and its parent is the particle whose interval
 contains the point. The particles of a component must be neighbours. After resampling they are, and
 until they are regrouped nothing has to be sorted. Within a component their order is arbitrary, or
-sorted: by a number, or along a Hilbert curve.
+sorted along a Hilbert curve of their state.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
-from mpfjax.checks import saying, shown
 from mpfjax.mixture import ParticleMixture, points
 from mpfjax.moves.resampling.sorting import (
+    BITS,
     MOST_DIMENSIONS,
-    bits_per_dimension,
     hilbert_index,
     order_by_key,
     order_by_segment,
     sortable_bits,
 )
-from mpfjax.operations.logarithms import (
-    as_inexact,
-    exp,
-    finite_or_zero,
-    log_or_nothing,
-    softmax,
-)
-from mpfjax.operations.prefix_sums import (
-    Positions,
-    needs_units,
-    sum_before,
-    to_units,
-    unit_bits,
-)
-from mpfjax.operations.segments import (
-    column_sums,
-    segment_counts,
-    segment_reduce,
-    spread,
-)
+from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing, softmax
+from mpfjax.operations.prefix_sums import Positions, needs_units, sum_before, to_units, unit_bits
+from mpfjax.operations.segments import column_sums, segment_counts, segment_reduce, spread
 from mpfjax.operations.stored import cond_if_any, stored, take, whole
 
-HILBERT = "hilbert"
-SortBy = Callable[[PyTree], Array] | Literal["hilbert"]
 _NUM_PRINCIPAL = 3  # more bits of fewer coordinates order a few hundred particles better
 _STEEPNESS = 1.702  # the logistic function of this multiple is nearly the normal CDF
 
@@ -103,6 +81,13 @@ class Line(NamedTuple):
         """The value of the component at each place."""
         return values if self.labels is None else spread(values, self.components)
 
+    def place_of(self, particle: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:
+        """The place of a particle, and its component."""
+        if self.order is None:
+            return particle, jnp.zeros((), jnp.int32)
+        place = jnp.argmax(self.order == particle).astype(jnp.int32)
+        return place, self.components[place]
+
     def extents(self, drawn: bool) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
         """The first and the last place of each component: of those `drawn` from, or of all."""
         last = self.weights.shape[0] - 1
@@ -147,20 +132,20 @@ class Line(NamedTuple):
 
 
 def in_line(
-    mixture: ParticleMixture, stays: Bool[Array, " n"] | None = None, sort_by: SortBy | None = None
+    mixture: ParticleMixture, stays: Bool[Array, " n"] | None = None, along_curve: bool = False
 ) -> Line:
-    """The particles in line, within each component by `sort_by` or as they are.
+    """The particles in line, within each component along a Hilbert curve or as they are.
 
     A weight may underflow to zero where its logarithm does not. Such a particle is not drawn where
     its component is resampled, and has a place among its component's where it `stays` as it is.
     """
     n, m = mixture.num_particles, mixture.num_components
-    if m == 1 and sort_by is None:
+    if m == 1 and not along_curve:
         weights = whole(mixture.component_weights, 0.0)
         log_masses = mixture.log_mixture_weights
         return Line(n, weights, jnp.ones(1, weights.dtype), log_masses, weights > 0)
     labels = mixture.component_indicators
-    if stays is not None or sort_by is not None:
+    if stays is not None or along_curve:
         # Particles that stay by rank need their component's as neighbours.
         stands = mixture.component_weights > 0
         if stays is not None:
@@ -179,12 +164,12 @@ def in_line(
     def as_they_are() -> tuple[Array, Array, Array]:
         return jnp.arange(labels.shape[0], dtype=jnp.int32), log_weights, labels
 
-    if sort_by is None:
+    if along_curve:
+        order = sorted_order(mixture, labels[:n])
+        order, log_weights, labels = in_order(whole(order, labels.shape[0] - 1))
+    else:
         is_mixed = jnp.any(labels[1:] < labels[:-1])
         order, log_weights, labels = cond_if_any(is_mixed, by_component, as_they_are)
-    else:
-        order = sorted_order(mixture, labels[:n], sort_by)
-        order, log_weights, labels = in_order(whole(order, labels.shape[0] - 1))
     log_largest = finite_or_zero(segment_reduce("max", log_weights, labels, m, -jnp.inf))
     relative = exp(log_weights - spread(log_largest, jnp.minimum(labels, m - 1)))
     is_drawn = relative > 0
@@ -194,54 +179,35 @@ def in_line(
     return Line(n, relative, totals, log_largest, is_drawn, order, labels)
 
 
-def sorted_order(
-    mixture: ParticleMixture, labels: Int[Array, " n"], sort_by: SortBy
-) -> Int[Array, " n"]:
-    """The indices of the particles by label, in [0, M], and within each label by `sort_by`.
+def sorted_order(mixture: ParticleMixture, labels: Int[Array, " n"]) -> Int[Array, " n"]:
+    """The indices of the particles by label, in [0, M], and in each along a Hilbert curve.
 
-    Particles are sorted by one coordinate, or along a Hilbert curve through several. Each
-    coordinate is standardised by the mean and deviation of the particle's component. More than 8
-    coordinates are reduced to their first principal components.
+    A single coordinate is sorted by its value. Several are standardised by the mean and deviation
+    of the particle's component. More than 8 are reduced to their first principal components.
     """
-    rows = _coordinates(mixture, sort_by)
+    rows = _coordinates(mixture)
     if rows.shape[0] > MOST_DIMENSIONS:
-        rows = _principal(as_inexact(rows), mixture)
+        rows = _principal(rows, mixture)
     if rows.shape[0] == 1:
-        if jnp.dtype(rows.dtype).itemsize > 4:
-            return jnp.lexsort((rows[0], labels)).astype(jnp.int32)
         keys = sortable_bits(rows[0])
     else:
-        num_bits = bits_per_dimension(rows.shape[0])
-        keys = hilbert_index(_cells(as_inexact(rows), mixture, num_bits), num_bits)
+        num_bits = BITS // rows.shape[0]
+        keys = hilbert_index(_cells(rows, mixture, num_bits), num_bits)
     return order_by_key(keys, labels, mixture.num_components + 1)
 
 
-def _coordinates(mixture: ParticleMixture, sort_by: SortBy) -> Array:
-    """The coordinates by which the particles are sorted, (d, n): a row for each."""
-    n = mixture.num_particles
-    if isinstance(sort_by, str):
-        leaves = [
-            leaf.reshape(n, -1)
-            for leaf in jax.tree.leaves(points(mixture.particles))
-            if jnp.issubdtype(leaf.dtype, jnp.floating)
-        ]
-        if sum(leaf.shape[1] for leaf in leaves) == 0:
-            raise ValueError(
-                f"sort_by: {sort_by!r}, which noise='rqmc' stands for, sorts by the state's"
-                " floating point numbers, and it has none; give a function of the particles"
-            )
-        dtype = jnp.result_type(*leaves)
-        return jnp.concatenate([leaf.astype(dtype).T for leaf in leaves])
-    with saying("sort_by", "called with the particles"):
-        values = sort_by(mixture.particles)
-    if not isinstance(values, jax.Array | np.ndarray) or jnp.iscomplexobj(values):
-        raise ValueError(f"sort_by: it returned {shown(values)}, no real array")
-    if values.ndim not in (1, 2) or values.shape[0] != n or values.size == 0:
-        raise ValueError(
-            f"sort_by: it returned shape {values.shape}, not a number per particle, ({n},), nor"
-            f" a few, ({n}, d)"
-        )
-    return jnp.asarray(values).reshape(n, -1).T
+def _coordinates(mixture: ParticleMixture) -> Float[Array, "d n"]:
+    """The floating point numbers of the states, a row for each."""
+    leaves = [
+        leaf.reshape(mixture.num_particles, -1)
+        for leaf in jax.tree.leaves(points(mixture.particles))
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
+    if sum(leaf.shape[1] for leaf in leaves) == 0:
+        which = "sorts by the state's floating point numbers, and it has none"
+        raise ValueError(f"along_curve: true, as with noise='rqmc', {which}")
+    dtype = jnp.result_type(*leaves)
+    return jnp.concatenate([leaf.astype(dtype).T for leaf in leaves])
 
 
 def _principal(rows: Float[Array, "d n"], mixture: ParticleMixture) -> Float[Array, "k n"]:

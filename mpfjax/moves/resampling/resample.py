@@ -1,5 +1,6 @@
 """Resampling within components: systematic, stratified or multinomial."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
@@ -18,7 +19,7 @@ from mpfjax.moves.resampling.allocation import (
     demands_of_groups,
 )
 from mpfjax.moves.resampling.ancestors import SCHEMES, Ancestors, draw_ancestors
-from mpfjax.moves.resampling.line import Line, SortBy, in_line
+from mpfjax.moves.resampling.line import Line, in_line
 from mpfjax.operations.logarithms import add_gradient
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import stored, take
@@ -53,15 +54,13 @@ class Resample(AbstractResampling):
       components within a group. None makes no groups. Use it if components are rival hypotheses
       about several objects, so that an object with many hypotheses does not take the slots of the
       others.
-    - `sort_by`: a function that returns a number for each particle, (n,), or several, (n, d).
-      Within their component the particles are resampled in the order of these numbers. Several
-      numbers are standardised within the component, and the order is along a Hilbert curve through
-      them, or, if there are more than 8, through their first principal components. "hilbert" uses
-      all floating-point components of the state; a function that selects those on which later
-      observations depend yields a better order. Systematic and stratified resampling in a good
-      order change the distribution least (Kitagawa 1996). With the "rqmc" noise of `Propagate`, the
-      filter is array randomised quasi-Monte Carlo (L'Ecuyer, Lécot and Tuffin 2008; Gerber and
-      Chopin 2015). Use it if mixture weights or likelihoods must be accurate.
+    - `along_curve`: whether the particles of a component are resampled in the order of a Hilbert
+      curve of their state, of which all floating-point components are standardised within the
+      component, and more than 8 reduced to their first principal components. Systematic and
+      stratified resampling in a good order change the distribution least (Kitagawa 1996). With the
+      "rqmc" noise of `Propagate`, the filter is array randomised quasi-Monte Carlo (L'Ecuyer, Lécot
+      and Tuffin 2008; Gerber and Chopin 2015); `with_quasi_monte_carlo` sets both. Use it if
+      mixture weights or likelihoods must be accurate.
     - `gradient`: how a derivative of the filter treats the resampling.
         - "none": it is ignored. The drawn indices are constants, and the derivative of the log
           marginal likelihood is NOT an estimate of the score: its bias does not decrease with the
@@ -79,7 +78,7 @@ class Resample(AbstractResampling):
     scheme: Scheme = eqx.field(static=True, default="systematic")
     ess_threshold: Share = eqx.field(static=True, default=1.0, kw_only=True)
     particles_per_component: Count | None = eqx.field(static=True, default=None, kw_only=True)
-    sort_by: SortBy | None = eqx.field(static=True, default=None, kw_only=True)
+    along_curve: bool = eqx.field(static=True, default=False, kw_only=True)
     gradient: Gradient = eqx.field(static=True, default="none", kw_only=True)
     allocation: Allocation = eqx.field(static=True, default="variance", kw_only=True)
     group: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(
@@ -91,12 +90,7 @@ class Resample(AbstractResampling):
             raise ValueError("group: groups have no effect together with particles_per_component")
 
     approximate = False
-
-    @property
-    def biases_score(self) -> bool:
-        """Whether it may resample without a gradient."""
-        return self.gradient == "none" and self.ess_threshold > 0
-
+    biases_score = property(lambda self: self.gradient == "none" and self.ess_threshold > 0)
     keeps_families = True
     """it updates the memory of Eve indices."""
 
@@ -104,14 +98,12 @@ class Resample(AbstractResampling):
         """Raise a `ValueError` for fewer slots than each component requires."""
         each = self.particles_per_component or 1
         if each * num_components > num_particles:
-            raise ValueError(
-                f"num_particles: {num_particles} is less than particles_per_component, {each}, for"
-                f" each of num_components, {num_components}"
-            )
+            which = f"particles_per_component, {each}, for each of num_components, {num_components}"
+            raise ValueError(f"num_particles: {num_particles} is less than {which}")
 
     def around(self, reference: Any) -> "Resample":
-        """The move itself, which finds the slot of the retained trajectory in the memory."""
-        return self
+        """The move by the multinomial scheme, which finds the trajectory's slot in the memory."""
+        return dataclasses.replace(self, scheme="multinomial")
 
     def due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Which components are to be resampled."""
@@ -134,9 +126,8 @@ class Resample(AbstractResampling):
     ) -> tuple[ParticleMixture, Ancestors]:
         """Resample the components that are `due`; with `ess_threshold` 1 all active ones are.
 
-        In conditional SMC the retained trajectory always has an offspring, and the ancestors have
-        their ordinary distribution, given that one slot of its component, each with equal
-        probability, has it as its parent. `draw_ancestors` describes the method.
+        In conditional SMC one slot of the retained trajectory's component, each with equal
+        probability, has it as its parent.
         """
         n, m = mixture.num_particles, mixture.num_components
         all_are_due = self.ess_threshold == 1.0
@@ -146,7 +137,7 @@ class Resample(AbstractResampling):
             is_kept = jnp.arange(n, dtype=jnp.int32) == keep
             stays = is_kept if stays is None else stays | is_kept
         # The drawn indices are whole numbers and have no derivative.
-        line = in_line(jax.lax.stop_gradient(mixture), stays, self.sort_by)
+        line = in_line(jax.lax.stop_gradient(mixture), stays, self.along_curve)
         targets = self.deal(mixture, line, due)
         ancestors = draw_ancestors(
             key, line, targets, self.scheme,
@@ -171,7 +162,7 @@ class Resample(AbstractResampling):
                 log_weights=jnp.where(slots.filled, log_weights, -jnp.inf),
                 component_indicators=slots.components if m > 1 else mixture.component_indicators,
             )
-            .with_order(self.sort_by is not None)
+            .with_order(self.along_curve)
         )
         offspring = Offspring(parents, targets, due, ancestors.reference)
         return after_resampling(mixture, redrawn, offspring), ancestors
@@ -180,7 +171,7 @@ class Resample(AbstractResampling):
         self, mixture: ParticleMixture, line: Line, due: Bool[Array, " m"]
     ) -> Int[Array, " m"]:
         """How many slots each component receives; components that are not `due` keep theirs."""
-        num_slots, demands = mixture.num_usable_slots, None
+        num_slots, demands = mixture.num_usable_slots, jnp.ones_like(line.totals)
         if self.group is not None:
             demands = demands_of_groups(mixture, self.group(mixture.particles), due)
         elif self.allocation != "equal" and mixture.num_components > 1:

@@ -8,20 +8,14 @@ corresponds to sorting numbers by value.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Shaped, UInt32
+from jaxtyping import Array, Float, Int, UInt32
 
 from mpfjax.operations.prefix_sums import count_upto
-from mpfjax.operations.stored import (
-    EXACT_IN_FLOAT32,
-    count_places,
-    stored,
-    take,
-    whole_blocks,
-)
+from mpfjax.operations.stored import EXACT_IN_FLOAT32, count_places, stored, take, whole_blocks
 
 _COUNTED_BLOCK = 32
 _MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # eight counts for each particle
-_BITS = 32
+BITS = 32
 MOST_DIMENSIONS = 8
 
 
@@ -29,17 +23,13 @@ def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array
     """The indices that make segments contiguous and ascending.
 
     Within a segment the original order stays; a label equal to `num_segments` comes last. For up to
-    a few hundred segments the place of each entry is counted, in O(n). For more, label and index
-    are packed into one integer if they fit: sorting one array is several times faster than
-    sorting pairs.
+    a few hundred segments the place of each entry is counted, in O(n), instead of sorted.
     """
     n = segments.shape[0]
     index = jnp.arange(n, dtype=jnp.int32)
     if num_segments <= _MOST_COUNTED_SEGMENTS and n < EXACT_IN_FLOAT32:
         return jnp.zeros_like(index).at[_places_by_segment(segments, num_segments)].set(index)
-    if (num_segments + 1) * n >= 2**31:
-        return jnp.argsort(segments, stable=True).astype(jnp.int32)
-    return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n
+    return jnp.argsort(segments, stable=True).astype(jnp.int32)
 
 
 def _places_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " n"]:
@@ -75,15 +65,15 @@ def order_by_key(
     """
     n = keys.shape[0]
     index_bits = max((n - 1).bit_length(), 1)
-    digit = _BITS - index_bits
+    digit = BITS - index_bits
     segments = segments.astype(jnp.uint32)
     index = jnp.arange(n, dtype=jnp.uint32)
     order = index.astype(jnp.int32)
-    for low in range(0, _BITS + (num_segments - 1).bit_length(), digit):
+    for low in range(0, BITS + (num_segments - 1).bit_length(), digit):
         # The bits from `low` on of the segment and the key, side by side.
-        word = keys >> low if low < _BITS else segments >> (low - _BITS)
-        if 0 < low < _BITS:
-            word = word | (segments << (_BITS - low))
+        word = keys >> low if low < BITS else segments >> (low - BITS)
+        if 0 < low < BITS:
+            word = word | (segments << (BITS - low))
         if low > 0:
             # Otherwise the gather would compute the keys again, not vectorised.
             word = take(stored(word & ((1 << digit) - 1)), order)
@@ -93,24 +83,13 @@ def order_by_key(
     return order
 
 
-def sortable_bits(values: Shaped[Array, " n"]) -> UInt32[Array, " n"]:
-    """Whole numbers of 32 bits in the same order as the values; NaN is the largest.
-
-    Floating point values are taken in float32.
-    """
-    if not jnp.issubdtype(values.dtype, jnp.floating):
-        values = values.astype(jnp.int32)
-        return jax.lax.bitcast_convert_type(values, jnp.uint32) ^ jnp.uint32(1 << 31)
+def sortable_bits(values: Float[Array, " n"]) -> UInt32[Array, " n"]:
+    """Whole numbers of 32 bits in the same order as the values in float32; NaN is the largest."""
     values = values.astype(jnp.float32)
     values = jnp.where(values == 0, 0.0, values)  # -0 is 0
     values = jnp.where(jnp.isnan(values), jnp.nan, values)
     bits = jax.lax.bitcast_convert_type(values, jnp.uint32)
     return jnp.where(bits >> 31 == 1, ~bits, bits | jnp.uint32(1 << 31))
-
-
-def bits_per_dimension(dimension: int) -> int:
-    """How many bits of each coordinate fit into an index of 32 bits, 1 to 8 coordinates."""
-    return _BITS // dimension
 
 
 def hilbert_index(cells: UInt32[Array, "d n"], num_bits: int) -> UInt32[Array, " n"]:
@@ -121,8 +100,6 @@ def hilbert_index(cells: UInt32[Array, "d n"], num_bits: int) -> UInt32[Array, "
     the curve turns. That leaves the Gray code of the index.
     """
     d = cells.shape[0]
-    if d == 1:
-        return cells[0]
     x = [cells[k] for k in range(d)]
     for bit in range(num_bits - 1, 0, -1):
         below = jnp.uint32((1 << bit) - 1)

@@ -1,13 +1,12 @@
-"""A tempered sampler of x_L given y_1..y_L of a short window, over x_0 and each step's noise.
+"""A tempered sampler of x_L given y_1..y_L of a short window, over x_0 and the keys of all draws.
 
-A particle is a whole path: x_0, or its noise, and the noise of each step; if a model draws x_t by a
-key, a separate key for each step, so that x_t is a function of x_0 and of the keys. y_t enters by
-powers (Del Moral, Doucet and Jasra 2006). After each power, paths are resampled and moved by
-Metropolis steps (resample-move, Gilks and Berzuini 2001; Chopin 2002) for the target p(x_0) Π_{s<t}
-L(y_s | x_s) L(y_t | x_t)^power. A step proposes either new noise for step t, which requires one
-step, or another x_0 with the same noise, which requires t, because the whole path follows. A pilot
-set of independent paths is moved along: it determines the powers and the steps of x_0, so that the
-evidence remains unbiased.
+A particle is a whole path: x_0, or its noise, and a key for the draw of each x_t, which is thus a
+function of x_0 and of the keys. y_t enters by powers (Del Moral, Doucet and Jasra 2006). Before
+each power, paths are moved by Metropolis steps (resample-move, Gilks and Berzuini 2001; Chopin
+2002) for the target p(x_0) Π_{s<t} L(y_s | x_s) L(y_t | x_t)^power, and after it resampled. A step
+proposes either another draw of x_t, which requires one transition, or another x_0 with the same
+keys, which requires t, because the whole path follows. A pilot set of independent paths is moved
+along: it determines the powers and the steps of x_0, so that the evidence remains unbiased.
 """
 
 from functools import partial
@@ -18,66 +17,43 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
+from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from mpfjax.mixture import flatten_states
-from mpfjax.models.base import is_made_of_noise, model_name, with_inputs
+from mpfjax.models.base import is_made_of_noise, model_name, require, with_inputs
 from mpfjax.models.law import law_of, refuse_marginalised
-from mpfjax.models.noise import noise_dtype, normal_of, uniform_of
-from mpfjax.operations.logarithms import (
-    default_float,
-    exp,
-    finite_max,
-    log_sum_exp,
-)
+from mpfjax.models.noise import normal_of, uniform_of
+from mpfjax.models.series import Series
+from mpfjax.operations.logarithms import default_float, exp, finite_max, log_sum_exp
 from mpfjax.operations.random import bits, normal, split, uniform
 from mpfjax.operations.stored import select_rows, take
 
 # Paths of the pilot for each of the sample.
 PILOT = 1 / 5
-# The part of the pilot that stays effective from one power to the next, the least growth of a power
-# as an exponent of 2, and the most powers of one observation, of which the last is 1 in any case.
-LEAST_PART, LEAST_GROWTH, MOST_POWERS = 0.8, -48.0, 512
-# Moves of the noise after each power of y_t, and the steps that those of x_0 may take there: one
-# takes t.
-NOISE_MOVES, PATH_STEPS = 6, 12
-# The part of the moves of x_0 that are walks; the others add a difference of two of the pilot.
-PART_OF_WALKS = 0.4
-# The correlation of the noise of a step with its proposal, and the least part of a standard
-# deviation of x_0 in a walk.
-NOISE_CORRELATION, LEAST_SIZE = 0.7, 2.0**-8
-
-
-class Window(NamedTuple):
-    """y, u, and whether y is present, of some steps; leaves have a leading axis of steps."""
-
-    observations: PyTree
-    inputs: PyTree
-    present: Bool[Array, " steps"]
-
-    def at(self, s: Int[Array, ""]) -> "Window":
-        """The data of one step."""
-        return jax.tree.map(lambda leaf: jax.lax.dynamic_index_in_dim(leaf, s, 0, False), self)
-
-
-class WindowSample(NamedTuple):
-    """What the sampler returns."""
-
-    states: PyTree
-    """x_L of each particle, equally weighted."""
-    log_increments: Float[Array, " steps"]
-    """log p(y_s | y_1..y_{s-1}) of each step, whose exponential has no bias in their product."""
-    is_rushed: Bool[Array, ""]
-    """whether some observation needed more than `MOST_POWERS` powers, and the sample is poor."""
+# The part of the pilot that stays effective from one power to the next, and the least growth of a
+# power as an exponent of 2: priors up to 10 million times as wide as the likelihood.
+LEAST_PART, LEAST_GROWTH = 0.8, -48.0
+# Draws of x_t that are proposed before each power of y_t, and the transitions that proposals of x_0
+# may take there: one takes t.
+STEP_MOVES, PATH_STEPS = 6, 12
+# The part of the moves of x_0 that are walks; the others add a difference of two of the pilot. The
+# least part of a standard deviation of x_0 in a walk.
+PART_OF_WALKS, LEAST_SIZE = 0.4, 2.0**-8
 
 
 class _Paths(NamedTuple):
     initial: PyTree  # x_0, or the noise that it is made of
-    noise: Array  # (n, steps, k), normal; or the words of a key, (n, steps, 2)
+    keys: UInt32[Array, "n steps 2"]  # the words of each draw's key
     previous: PyTree  # x_{t-1}
     states: PyTree  # x_t
-    log_past: Float[Array, " n"]  # log L(y_1..y_{t-1})
+    log_past: Float[Array, " n"]  # log p(x_0) L(y_1..y_{t-1})
     log_likelihood: Float[Array, " n"]  # log L(y_t)
+
+    def before_next(self) -> "_Paths":
+        """The paths before x_{t+1} is drawn and weighed."""
+        log_past = self.log_past + self.log_likelihood
+        zeros = jnp.zeros_like(log_past)
+        return self._replace(previous=self.states, log_past=log_past, log_likelihood=zeros)
 
 
 def check_initial_density(model: Any, needed_by: str) -> None:
@@ -85,11 +61,7 @@ def check_initial_density(model: Any, needed_by: str) -> None:
     refuse_marginalised(model, needed_by, "start from a mixture of your own")
     if is_made_of_noise(model, "initial"):
         return
-    if not callable(getattr(model, "log_initial", None)):
-        how = "nor makes x_0 of noise, initial_from_noise"
-        raise ValueError(
-            f"model: {model_name(model)} defines no log_initial, {how}; {needed_by} needs one"
-        )
+    require(model, "log_initial", needed_by)
     states = jax.eval_shape(lambda key: model.sample_initial(key, 2), jax.random.key(0))
     for leaf in jax.tree.leaves(states):
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -98,128 +70,150 @@ def check_initial_density(model: Any, needed_by: str) -> None:
 
 
 def sample_window(
-    key: Key[Array, ""], model: Any, window: Window, num_particles: int
-) -> WindowSample:
-    """x_L ~ p(x_L | y_1..y_L) of N particles, with the evidence of each step.
+    key: Key[Array, ""], model: Any, window: Series, num_particles: int
+) -> tuple[PyTree, Float[Array, " steps"]]:
+    """N draws of p(x_L | y_1..y_L), and log p(y_s | y_1..y_{s-1}) of each step.
+
+    The draws are equally weighted, and the product of the exponentials is unbiased.
 
     - `model`: without inputs; each step's model gets the window's.
+    - `window`: the data of L steps, of which it is known which are `present`.
 
     Raises `ValueError` where derivatives are asked for.
     """
-    model, window = jax.tree.map(_without_derivative, (model, window))
-    key_first, key_steps = split(key, 2)
-    num_steps = window.present.shape[0]
-    paths = _first_paths(key_first, model, num_particles, num_steps)
-
-    def observe(s: Int[Array, ""], carry: tuple) -> tuple:
-        paths, log_increments, is_rushed = carry
-        step_key = jax.random.fold_in(key_steps, s)
-        paths, log_increment, ran_out = _observe(step_key, model, window, paths, s, num_particles)
-        return paths, log_increments.at[s].set(log_increment), is_rushed | ran_out
-
-    first = paths, jnp.zeros(num_steps, default_float()), jnp.zeros((), bool)
-    paths, log_increments, is_rushed = jax.lax.fori_loop(0, num_steps, observe, first)
-    states = jax.tree.map(lambda leaf: leaf[:num_particles], paths.states)
-    return WindowSample(states, log_increments, is_rushed)
-
-
-def _without_derivative(leaf: Any) -> Any:
-    """The leaf, of which a derivative would be wrong without notice: accepted moves have none."""
-    return _constant(leaf) if eqx.is_inexact_array(leaf) else leaf
+    floats, others = eqx.partition((model, window), eqx.is_inexact_array)
+    sampler = _Sampler(*eqx.combine(_constant(floats), others), num_particles)
+    key_paths, key_steps = split(key, 2)
+    steps = jnp.arange(window.length, dtype=jnp.int32), split(key_steps, window.length)
+    paths, log_increments = jax.lax.scan(sampler.observe, sampler.first_paths(key_paths), steps)
+    return jax.tree.map(lambda leaf: leaf[:num_particles], paths.states), log_increments
 
 
 @jax.custom_jvp
-def _constant(values: Array) -> Array:
+def _constant(values: PyTree) -> PyTree:
+    """Values whose derivatives would be wrong without notice: accepted moves have none."""
     return values
 
 
 @_constant.defjvp
 def _refuse(primals: Any, tangents: Any) -> Any:
-    raise ValueError(
-        "filter: with_initialisation and with_restarts have no derivatives in the model"
-    )
+    who = "with_initialisation and with_restarts"
+    raise ValueError(f"filter: {who} have no derivatives in the model")
 
 
-def _first_paths(key: Key[Array, ""], model: Any, num_particles: int, num_steps: int) -> _Paths:
-    """The paths before any observation, and after them those of the pilot."""
-    key_initial, key_noise = split(key, 2)
-    n = num_particles + max(2, round(PILOT * num_particles))
-    if is_made_of_noise(model, "initial"):
-        initial = normal(key_initial, (n, model.initial_noise_dimension), default_float())
-    else:
-        initial = law_of(model).sample_initial(key_initial, n)
-    states = _initial_states(model, initial)
-    k = law_of(model).noise_dimension(states) if is_made_of_noise(model) else 2
-    noise = _noise_of(model, states, bits(key_noise, (num_steps * k, n)))
-    return _at_start(initial, noise.reshape(n, num_steps, k), states)
+class _Sampler(NamedTuple):
+    model: Any
+    window: Series
+    n: int  # of the sample; all further paths are of the pilot
 
+    def first_paths(self, key: Key[Array, ""]) -> _Paths:
+        """The paths before any observation."""
+        key_initial, key_draws = split(key, 2)
+        number = self.n + max(2, round(PILOT * self.n))
+        if is_made_of_noise(self.model, "initial"):
+            initial = normal(key_initial, (number, self.model.initial_noise_dimension))
+        else:
+            initial = law_of(self.model).sample_initial(key_initial, number)
+        return self.paths_from(initial, bits(key_draws, (number, self.window.length, 2)))
 
-def _observe(
-    key: Key[Array, ""], model: Any, window: Window, paths: _Paths, s: Int[Array, ""], n: int
-) -> tuple[_Paths, Float[Array, ""], Bool[Array, ""]]:
-    """The paths given the window's step s too, its evidence, and whether the powers ran out.
+    def paths_from(self, initial: PyTree, keys: UInt32[Array, "n steps 2"]) -> _Paths:
+        """Paths from these x_0, before any observation."""
+        law = law_of(self.model)
+        if is_made_of_noise(self.model, "initial"):
+            states, log_prior = law.make_initial(initial), -0.5 * jnp.sum(initial**2, axis=1)
+        else:
+            states, log_prior = initial, law.log_initial(initial)
+        log_prior = log_prior.astype(default_float())
+        return _Paths(initial, keys, states, states, log_prior, jnp.zeros_like(log_prior))
 
-    At first they are only advanced, by the loop that moves them later, so that a model is compiled
-    once.
-    """
-    number = paths.noise.shape[0]
-    num_moves = NOISE_MOVES + jnp.maximum(PATH_STEPS // (s + 1), 1)
-    num_words = 4 + 2 * flatten_states(paths.initial).shape[1] + paths.noise.shape[2]
+    def advance(self, s: Int[Array, ""], paths: _Paths) -> _Paths:
+        """The paths one step further, to the window's step s."""
+        now = jax.tree.map(lambda leaf: leaf[s], self.window)
+        law = law_of(with_inputs(self.model, now.inputs))
 
-    def resample(key: Key[Array, ""], paths: _Paths, log_weights: Float[Array, " n"]) -> _Paths:
-        """The sample by its own weights, and the pilot by its own."""
-        key_sample, key_pilot = split(key, 2)
-        ancestors = systematic_sample(key_sample, log_weights[:n], n)
-        of_pilot = n + systematic_sample(key_pilot, log_weights[n:], number - n)
-        ancestors = jnp.concatenate([ancestors, of_pilot])
-        return jax.tree.map(lambda leaf: take(leaf, ancestors), paths)
+        def draw(words: UInt32[Array, "2"], state: PyTree) -> PyTree:
+            alone = jax.tree.map(lambda leaf: leaf[None], state)
+            drawn = law.draw(jax.random.wrap_key_data(words), alone)
+            return jax.tree.map(lambda leaf: leaf[0], drawn)
 
-    def temper(carry: tuple) -> tuple:
-        old_key, old, power, log_increment, count = carry
-        key, key_resample, key_moves = split(old_key, 3)
-        is_first, rest = count == 0, 1 - power
-        growth = jnp.where(count == MOST_POWERS, rest, _growth(old.log_likelihood[n:], rest))
-        is_last = power + growth > 1 - 1e-6
-        growth, after = jnp.where(is_last, rest, growth), jnp.where(is_last, 1.0, power + growth)
-        log_weights = growth * old.log_likelihood
-        log_mass = log_sum_exp(log_weights[:n]) - np.log(n)
-        paths = resample(key_resample, old, log_weights)
-        pilot = flatten_states(paths.initial)[n:]
-        key, paths, after, log_mass = jax.tree.map(
-            partial(jnp.where, is_first),
-            (old_key, old, jnp.zeros_like(after), jnp.zeros_like(log_mass)),
-            (key, paths, after, log_mass),
-        )
+        states = jax.vmap(draw)(paths.keys[:, s], paths.states)
+        values = jnp.where(now.present, law.log_likelihood(now.observations, states), 0.0)
+        values = values.astype(paths.log_past.dtype)
+        return paths.before_next()._replace(states=states, log_likelihood=values)
 
-        def move(i: Int[Array, ""], paths: _Paths) -> _Paths:
-            words = bits(jax.random.fold_in(key_moves, i), (num_words, number))
-            is_of_noise = i < NOISE_MOVES
-            new = _propose(words[1:], model, paths, s, pilot, is_of_noise)
-            new = jax.tree.map(partial(jnp.where, is_first), paths, new)
-            first = jnp.where(is_of_noise, s, 0)
-            new = jax.lax.fori_loop(first, s + 1, partial(_advance, model, window), new)
-            log_ratio = _log_target(model, new, after) - _log_target(model, paths, after)
+    def observe(
+        self, paths: _Paths, step: tuple[Int[Array, ""], Key[Array, ""]]
+    ) -> tuple[_Paths, Float[Array, ""]]:
+        """The paths given the window's step s too, and its evidence."""
+        (s, key), n, zero = step, self.n, jnp.zeros((), default_float())
+        # The first move, at a power of zero, advances all of them.
+        paths = paths.before_next()
+
+        def temper(carry: tuple) -> tuple:
+            key, paths, power, log_evidence = carry
+            key, key_moves, key_sample, key_pilot = split(key, 4)
+            paths = self.move(key_moves, paths, s, power)
+            growth = _growth(paths.log_likelihood[n:], 1 - power)
+            log_weights = growth * paths.log_likelihood
+            log_evidence += log_sum_exp(log_weights[:n]) - np.log(n)
+            sample = systematic_sample(key_sample, log_weights[:n], n)
+            pilot = systematic_sample(key_pilot, log_weights[n:], log_weights.shape[0] - n)
+            ancestors = jnp.concatenate([sample, n + pilot])
+            paths = jax.tree.map(lambda leaf: take(leaf, ancestors), paths)
+            return key, paths, power + growth, log_evidence
+
+        first = key, paths, zero, zero
+        _, paths, _, log_evidence = jax.lax.while_loop(lambda carry: carry[2] < 1, temper, first)
+        return paths, log_evidence
+
+    def move(
+        self, key: Key[Array, ""], paths: _Paths, s: Int[Array, ""], power: Float[Array, ""]
+    ) -> _Paths:
+        """The paths after Metropolis steps: by other draws of x_s, and by another x_0.
+
+        Steps of x_0 are walks of many sizes, another in each coordinate, and differences of any two
+        of the pilot, which lead from mode to mode.
+        """
+        rows = flatten_states(paths.initial)
+        (number, d), pilot = rows.shape, rows[self.n :]
+        spreads = jnp.std(pilot, axis=0, keepdims=True)
+        unravel = jax.vmap(ravel_pytree(jax.tree.map(lambda leaf: leaf[0], paths.initial))[1])
+
+        def propose(words: UInt32[Array, "w n"], paths: _Paths, is_of_step: Array) -> _Paths:
+            kind, *pair = uniform_of(words[2:5], pilot.dtype)
+            one, other = (take(pilot, (len(pilot) * place).astype(jnp.int32)) for place in pair)
+            sizes = spreads * LEAST_SIZE ** uniform_of(words[5 : 5 + d], pilot.dtype).T
+            walk = sizes * normal_of(words[5 + d :], pilot.dtype).T
+            steps = select_rows(kind < PART_OF_WALKS, walk, one - other)
+            new = self.paths_from(unravel(flatten_states(paths.initial) + steps), paths.keys)
+            redrawn = paths._replace(
+                keys=paths.keys.at[:, s].set(words[:2].T),
+                states=paths.previous,
+                log_likelihood=new.log_likelihood,
+            )
+            return jax.tree.map(partial(jnp.where, is_of_step), redrawn, new)
+
+        def log_target(paths: _Paths) -> Float[Array, " n"]:
+            # A power of zero admits any likelihood, also none.
+            return paths.log_past + jnp.where(power > 0, power * paths.log_likelihood, 0.0)
+
+        def step(i: Int[Array, ""], paths: _Paths) -> _Paths:
+            words = bits(jax.random.fold_in(key, i), (6 + 2 * d, number))
+            is_of_step = i < STEP_MOVES
+            first, new = jnp.where(is_of_step, s, 0), propose(words[1:], paths, is_of_step)
+            new = jax.lax.fori_loop(first, s + 1, self.advance, new)
+            log_ratio = log_target(new) - log_target(paths)
             is_accepted = jnp.log(uniform_of(words[0], log_ratio.dtype)) < log_ratio
-            return select_rows(is_accepted | is_first, new, paths)
+            return select_rows(is_accepted, new, paths)
 
-        # Where y_t is no surprise at all, the draws are as good as new ones.
-        is_moved = (power > 0) | (after < 1)
-        count_moves = jnp.where(is_first, 1, jnp.where(is_moved, num_moves, 0))
-        paths = jax.lax.fori_loop(0, count_moves, move, paths)
-        return key, paths, after, log_increment + log_mass, count + 1
-
-    zero = jnp.zeros((), default_float())
-    first = key, paths, zero, zero, jnp.zeros((), jnp.int32)
-    _, paths, _, log_increment, count = jax.lax.while_loop(
-        lambda carry: carry[2] < 1, temper, first
-    )
-    return paths, log_increment, count > MOST_POWERS
+        num_steps = STEP_MOVES + jnp.maximum(PATH_STEPS // (s + 1), 1)
+        return jax.lax.fori_loop(0, num_steps, step, paths)
 
 
 def systematic_sample(
-    key: Key[Array, ""], log_weights: Float[Array, " n"], number: int | Int[Array, ""]
-) -> Int[Array, " n"]:
-    """Indices by these weights, of which the first `number` are a systematic sample.
+    key: Key[Array, ""], log_weights: Float[Array, " n"], number: int
+) -> Int[Array, " number"]:
+    """So many indices, a systematic sample by these weights.
 
     By a search, which compiles in a fraction of the time that `Resample` takes, and is run seldom.
     """
@@ -228,100 +222,22 @@ def systematic_sample(
     log_weights = jnp.where(jnp.max(log_weights) > -jnp.inf, log_weights, 0.0)
     weights = exp(log_weights - finite_max(log_weights))
     cumulative = jnp.cumsum(weights)
-    ranks = jnp.arange(n, dtype=weights.dtype) + uniform(key, (), weights.dtype)
-    points = ranks / jnp.asarray(number, weights.dtype) * cumulative[-1]
-    indices = jnp.searchsorted(cumulative, points, side="right").astype(jnp.int32)
+    ranks = jnp.arange(number, dtype=weights.dtype) + uniform(key, (), weights.dtype)
+    indices = jnp.searchsorted(cumulative, ranks / number * cumulative[-1], side="right")
     # Rounding must not lead past the last particle of positive weight.
-    return jnp.minimum(indices, jnp.max(jnp.where(weights > 0, jnp.arange(n, dtype=jnp.int32), 0)))
+    last = jnp.max(jnp.where(weights > 0, jnp.arange(n, dtype=jnp.int32), 0))
+    return jnp.minimum(indices.astype(jnp.int32), last)
 
 
 def _growth(log_likelihood: Float[Array, " p"], rest: Float[Array, ""]) -> Float[Array, ""]:
     """The growth of the power, up to the `rest`, that leaves enough of the pilot effective.
 
-    Found on a logarithmic scale, so that it is above zero however narrow the likelihood is. Paths
-    without any likelihood are lost with the smallest power, and do not count.
+    It is selected on a logarithmic scale, so that it is above zero however narrow the likelihood
+    is. Paths without any likelihood are lost with the smallest power, and do not count.
     """
     below = log_likelihood - finite_max(log_likelihood)
     number = jnp.sum((log_likelihood > -jnp.inf).astype(log_likelihood.dtype))
     growths = rest * jnp.exp2(jnp.arange(LEAST_GROWTH, 1 / 8, 1 / 8))
     weights = exp(growths[:, None] * below[None])
-    is_enough = jnp.sum(weights, axis=1) ** 2 >= LEAST_PART * number * jnp.sum(weights**2, axis=1)
-    return jnp.max(jnp.where(is_enough, growths, growths[0]))
-
-
-def _propose(
-    words: UInt32[Array, "w n"],
-    model: Any,
-    paths: _Paths,
-    s: Int[Array, ""],
-    pilot: Array,
-    is_of_noise: Bool[Array, ""],
-) -> _Paths:
-    """The paths with other noise of step s at x_{s-1}, or with the same noise at another x_0.
-
-    Steps of x_0 are walks of many sizes, another in each coordinate, and differences of any two of
-    the pilot, which lead from mode to mode.
-    """
-    (p, d), flat = pilot.shape, flatten_states(paths.initial)
-    unravel = jax.vmap(ravel_pytree(jax.tree.map(lambda leaf: leaf[0], paths.initial))[1])
-    kind, *pair = uniform_of(words[:3], pilot.dtype)
-    sizes, directions = words[3 : 3 + d], words[3 + d : 3 + 2 * d]
-    spreads = jnp.std(pilot, axis=0, keepdims=True)
-    walk = spreads * LEAST_SIZE ** uniform_of(sizes, pilot.dtype).T
-    walk *= normal_of(directions, pilot.dtype).T
-    one, other = (take(pilot, (p * place).astype(jnp.int32)) for place in pair)
-    initial = unravel(flat + select_rows(kind < PART_OF_WALKS, walk, one - other))
-    noise = _noise_of(model, paths.states, words[3 + 2 * d :])
-    if is_made_of_noise(model):
-        old = jax.lax.dynamic_index_in_dim(paths.noise, s, 1, False)
-        noise = NOISE_CORRELATION * old + np.sqrt(1 - NOISE_CORRELATION**2) * noise
-    noise = jax.lax.dynamic_update_index_in_dim(paths.noise, noise, s, 1)
-    at_start = _at_start(initial, paths.noise, _initial_states(model, initial))
-    at_step = paths._replace(
-        noise=noise, states=paths.previous, log_likelihood=at_start.log_likelihood
-    )
-    return jax.tree.map(partial(jnp.where, is_of_noise), at_step, at_start)
-
-
-def _advance(model: Any, window: Window, s: Int[Array, ""], paths: _Paths) -> _Paths:
-    """The paths one step further, to the window's step s."""
-    now, noise = window.at(s), jax.lax.dynamic_index_in_dim(paths.noise, s, 1, False)
-    law = law_of(with_inputs(model, now.inputs))
-    if is_made_of_noise(model):
-        states = law.make(noise, paths.states)
-    else:
-
-        def draw(words: UInt32[Array, "2"], state: PyTree) -> PyTree:
-            alone = jax.tree.map(lambda leaf: leaf[None], state)
-            drawn = law.draw(jax.random.wrap_key_data(words), alone)
-            return jax.tree.map(lambda leaf: leaf[0], drawn)
-
-        states = jax.vmap(draw)(noise, paths.states)
-    values = law.log_likelihood(now.observations, states)
-    log_likelihood = jnp.where(now.present, values, 0.0).astype(paths.log_likelihood.dtype)
-    log_past = paths.log_past + paths.log_likelihood
-    return _Paths(paths.initial, paths.noise, paths.states, states, log_past, log_likelihood)
-
-
-def _log_target(model: Any, paths: _Paths, power: Any) -> Float[Array, " n"]:
-    if is_made_of_noise(model, "initial"):
-        log_prior = -0.5 * jnp.sum(paths.initial**2, axis=1)
-    else:
-        log_prior = law_of(model).log_initial(paths.initial)
-    return log_prior + paths.log_past + power * paths.log_likelihood
-
-
-def _at_start(initial: PyTree, noise: Array, states: PyTree) -> _Paths:
-    """Paths before any observation."""
-    zeros = jnp.zeros(noise.shape[0], default_float())
-    return _Paths(initial, noise, states, states, zeros, zeros)
-
-
-def _initial_states(model: Any, initial: PyTree) -> PyTree:
-    is_noise = is_made_of_noise(model, "initial")
-    return law_of(model).make_initial(initial) if is_noise else initial
-
-
-def _noise_of(model: Any, states: PyTree, words: UInt32[Array, "k n"]) -> Array:
-    """Noise of these random bits: normal, or the words of keys."""
-    return (normal_of(words, noise_dtype(states)) if is_made_of_noise(model) else words).T
+    is_poor = jnp.sum(weights, axis=1) ** 2 < LEAST_PART * number * jnp.sum(weights**2, axis=1)
+    return jnp.max(jnp.where(is_poor, growths[0], growths))

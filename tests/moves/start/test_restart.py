@@ -134,7 +134,7 @@ class Offset(WithDensity):
 @pytest.mark.parametrize("change", [{"constant": -2e4}, {"reach": 10.0}], ids=["offset", "reach"])
 def test_restarts_where_log_likelihoods_are_large_or_minus_infinity(change):
     plain = mpfjax.mixture_particle_filter(Offset(**change), 200, 3)
-    filter = restarts(mpfjax.with_alarm(mpfjax.with_initialisation(plain, LENGTH), 1000))
+    filter = restarts(mpfjax.with_initialisation(plain, LENGTH))
     runs = mpfjax.monte_carlo(jax.random.split(KEY, 100), filter, CARRIED, mean)
     constants = change.get("constant", 0.0) * len(CARRIED)
     increments = np.asarray(runs.log_likelihood_increments, float)
@@ -185,8 +185,7 @@ def test_a_start_and_restarts_are_one_whichever_comes_first():
     both = restarts(START), mpfjax.with_initialisation(restarts(PLAIN), LENGTH)
     assert eqx.tree_equal(*both)
     assert sum(isinstance(move, Restart) for move in both[0].moves) == 1
-    alarms = mpfjax.with_alarm(FILTER, 30), restarts(mpfjax.with_alarm(START, 30))
-    assert eqx.tree_equal(*alarms)
+    assert eqx.tree_equal(mpfjax.with_alarm(FILTER), restarts(mpfjax.with_alarm(START)))
     starts = mpfjax.with_alarm(START), mpfjax.with_initialisation(mpfjax.with_alarm(PLAIN), LENGTH)
     assert eqx.tree_equal(*starts)
 
@@ -194,18 +193,18 @@ def test_a_start_and_restarts_are_one_whichever_comes_first():
 @pytest.mark.exactness
 def test_an_alarm_begins_where_the_start_ends():
     """What it replaces explains nothing, and its increment is of all steps."""
-    filter = mpfjax.with_alarm(START, 100)
+    filter = mpfjax.with_alarm(START)
     runs = mpfjax.monte_carlo(jax.random.split(KEY, 20), filter, SEEN, mean)
     assert not np.asarray(runs.alarm).any()
     against = np.asarray(runs.log_evidence_against_start)
-    assert (against[:, LENGTH - 1 :].max(axis=1) < 0).all()
+    assert (against[:, LENGTH:].max(axis=1) < 0).all()
 
 
 def test_what_cannot_begin_so_is_refused():
     with pytest.raises(ValueError, match="defines no log_initial"):
         mpfjax.with_initialisation(mpfjax.particle_filter(Batched(), 50))
-    with pytest.raises(ValueError, match="num_particles: 40, of which 2 may be all of the slots"):
-        mpfjax.with_restarts(mpfjax.mixture_particle_filter(WithKeys(), 40, 12))
+    with pytest.raises(ValueError, match="initial_moves: SelectInitial does more than regroup"):
+        mpfjax.with_initial_selection(START)
     with pytest.raises(
         ValueError, match="2 steps, fewer than num_observations of with_initialisation, 3"
     ):
@@ -236,15 +235,6 @@ class Bounded(ScalarLinear):
     def log_likelihood(self, observation, states):
         log_density = super().log_likelihood(observation, states)
         return jnp.where(jnp.abs(observation - states) < 30, log_density, -jnp.inf)
-
-
-@pytest.mark.exactness
-def test_a_change_of_the_model_reaches_the_alarm():
-    plain, other = mpfjax.particle_filter(MODEL, 60), ScalarLinear(m=3.0)
-    changed = mpfjax.with_alarm(plain).replace(model=other)
-    made = mpfjax.with_alarm(plain.replace(model=other))
-    runs = [mpfjax.run_filter(jax.random.key(0), f, SCALARS[:3]) for f in (changed, made)]
-    np.testing.assert_array_equal(*(run.log_evidence_against_start for run in runs))
 
 
 class Kidnapped(ScalarLinear):

@@ -7,7 +7,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.start.sampler import Window, check_initial_density, sample_window
+from mpfjax.moves.start.sampler import check_initial_density, sample_window
 from tests.moves.test_marginalised import MODEL as CONDITIONALLY_LINEAR
 from tests.unbiased import assert_unbiased
 
@@ -17,7 +17,7 @@ KEY = jax.random.key(0)
 def window_of(observations, present=None):
     observations = jnp.asarray(observations, jnp.float32)
     present = np.ones(len(observations), bool) if present is None else present
-    return Window(observations, None, jnp.asarray(present))
+    return mpfjax.Series(observations, present=jnp.asarray(present))
 
 
 def starts(model, window, num_particles, num_runs, key=KEY):
@@ -25,8 +25,8 @@ def starts(model, window, num_particles, num_runs, key=KEY):
 
     @jax.jit
     def start(key):
-        sample = sample_window(key, model, window, num_particles)
-        return sample.states, jnp.sum(sample.log_increments)
+        states, log_increments = sample_window(key, model, window, num_particles)
+        return states, jnp.sum(log_increments)
 
     return jax.tree.map(np.asarray, jax.lax.map(start, jax.random.split(key, num_runs)))
 
