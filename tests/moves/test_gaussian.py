@@ -6,11 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import mpfjax
 from mpfjax import GaussianRegeneration
-from mpfjax.exact import kalman_filter
 from tests.examples import make_mixture
-from tests.marking import exactness
 from tests.unbiased import assert_unbiased
 
 NUM_DRAWS = 2000
@@ -61,30 +58,3 @@ def test_a_singular_covariance_draws_within_its_plane_and_where_leaves_the_rest_
     np.testing.assert_array_equal(after.particles["kind"], 10 * after.component_indicators)
     with pytest.raises(ValueError, match=r"where: the state\['kind'\] is int32"):
         GaussianRegeneration()(jax.random.key(0), mixture)
-
-
-@pytest.mark.parametrize(
-    ("max_components", "importance"), [(1, "propagated"), *exactness([(3, "predictive_gaussian")])]
-)
-def test_moments_are_the_kalman_filters(max_components, importance):
-    """On a linear-Gaussian model one component is exact, and any number close to it."""
-    model = mpfjax.LinearGaussianModel(
-        A=0.9 * jnp.eye(2), Q=jnp.array([[0.6, 0.1], [0.1, 0.6]]), H=jnp.ones((1, 2)),
-        R=0.3 * jnp.eye(1), m0=jnp.zeros(2), P0=jnp.eye(2),
-    )  # fmt: skip
-    observations = jnp.array([[0.3], [1.2], [-0.5], [2.0], [0.1]])
-    exact = kalman_filter(model, observations)
-    filter = mpfjax.gaussian_mixture_particle_filter(
-        model, 2000, max_components, importance=importance
-    )
-
-    def collect(mixture):
-        centred = mixture.particles - mixture.mean()[None]
-        return mixture.mean(), mixture.expectation(centred[:, :, None] * centred[:, None])
-
-    keys = jax.random.split(jax.random.key(0), 100)
-    run = mpfjax.monte_carlo(keys, filter, observations, collect)
-    # Cut into three, a Gaussian's parts are not Gaussian: a bias of a few hundredths is theirs.
-    slack = 1e-3 if max_components == 1 else 0.03
-    for found, expected in zip(run.collected, (exact.means, exact.covariances), strict=True):
-        assert_unbiased(found, expected, slack=slack)

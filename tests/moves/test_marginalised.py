@@ -42,18 +42,11 @@ FILTERS = {
     "all children, in components": lambda: own(
         [PropagateRegimes(), KMeans(2)], 2, initial_moves=[KMeans(2, reseed=True)]
     ),
-    "halves": lambda: own([Resample(), Predict(), Reweight()]),
     "guided halves": lambda: own(
         [Resample(), Predict(RegimeProposal()), Reweight()]
     ),
     "fully adapted": lambda: mpfjax.auxiliary_particle_filter(
         MODEL, NUM_PARTICLES, RegimeProposal()
-    ),
-    "optimal proposal, mpf rqmc": lambda: mpfjax.mixture_particle_filter(
-        MODEL, NUM_PARTICLES, 3, proposal=RegimeProposal(), noise="rqmc", regroup_every=1
-    ),
-    "families": lambda: mpfjax.with_proposals_per_particle(
-        mpfjax.particle_filter(MODEL, NUM_PARTICLES), 3
     ),
 }  # fmt: skip
 QUICK = list(FILTERS)[:2]

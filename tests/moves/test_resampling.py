@@ -196,15 +196,6 @@ def test_slots_are_shared(mixture, move, expected):
         assert wanted is None or abs(number - wanted) <= 1, found
 
 
-@pytest.mark.exactness
-def test_between_these_parts_as_much_is_shared_equally_as_keeps_ten_effective_particles():
-    mixture = three_components((0.5, 0.5, 1e-12), (0.8, 0.8, 0.8), n=50)
-    sizes = np.asarray(mixture.component_effective_sample_sizes)
-    expected = FEWEST * np.mean(50 / sizes)
-    assert 50 * EQUAL_PARTS[0] < expected < 50 * EQUAL_PARTS[1]
-    assert abs(int(draw(Resample(), mixture).component_counts[2]) - expected) <= 1
-
-
 @pytest.mark.parametrize("n", [3, 1, 29])
 def test_fewer_slots_than_components_fill_up_all_the_same(n):
     rng = np.random.default_rng(n)

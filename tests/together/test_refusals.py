@@ -458,7 +458,7 @@ REFUSED = (
                      mpfjax.GaussNewtonProposal, SelectInitial)
     ),
     ("propagate: gradient 'stop'",
-     lambda: mpfjax.PropagateNested(Propagate(gradient="stop"))),
+     lambda: mpfjax.PropagateNested(Propagate(gradient="stop"), 2)),
     ("comes before any propagation: there is no x_t yet",
      lambda: run(Filter(MODEL, [mpfjax.RandomWalkMetropolis(), Propagate()], 4))),
     ("IslandInteraction leaves no particle one parent", lambda: Filter(MODEL, [Propagate(),

@@ -360,7 +360,7 @@ class TestBias:
             self.warn(filter, parameters)
 
     def test_a_draw_that_is_kept_of_several_biases_it(self):
-        moves = [mpfjax.Resample(gradient="stop"), mpfjax.PropagateNested(mpfjax.Propagate())]
+        moves = [mpfjax.Resample(gradient="stop"), mpfjax.PropagateNested(mpfjax.Propagate(), 2)]
         with pytest.warns(UserWarning, match="fit: PropagateNested has no gradient"):
             self.warn(mpfjax.Filter(ScalarLinear(), moves, 16))
 

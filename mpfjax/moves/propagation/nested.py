@@ -34,7 +34,7 @@ class PropagateNested(AbstractPropagationOfEach, AbstractWrapper):
     """
 
     propagate: Propagate
-    num_draws: Count = eqx.field(static=True, default=4)
+    num_draws: Count = eqx.field(static=True)
 
     holds = ("propagate",)
     biases_score = True
