@@ -106,7 +106,8 @@ def select(
     order = sorted_order(pool, pool.component_indicators) if in_order else None
     weights = whole(trust if order is None else take(trust, order), 0.0)
     totals = jnp.sum(weights, keepdims=True)
-    line = Line(pool.num_particles, weights, totals, jnp.zeros_like(totals), weights > 0, order)
+    zero = jnp.zeros_like(totals)
+    line = Line(pool.num_particles, weights, totals, zero, weights > 0, order, labels=None)
     targets = jnp.full(1, number, jnp.int32)
     indices = draw_ancestors(key, line, targets, "systematic", num_slots=number).particles
     # No ν is below a quarter, so that their inverses need no logarithms to be summed.

@@ -166,7 +166,7 @@ class PropagateRegimes(AbstractPropagation):
         """N of the N K children, their moments predicted."""
         if self.regroup is not None:
             family = self.regroup(key, family)
-        line = in_line(jax.lax.stop_gradient(family))
+        line = in_line(jax.lax.stop_gradient(family), None, along_curve=False)
         targets = Resample().deal(mixture, line, family.active)
         # More slots than children are of no use: a copy would have the moments that it copies.
         num_children = line.sums((line.weights > 0).astype(line.weights.dtype))

@@ -44,8 +44,8 @@ class Line(NamedTuple):
     totals: Float[Array, " m"]  # of the weights, zero for a dead component
     log_units: Float[Array, " m"]
     is_drawn: Bool[Array, " p"]  # at which places a particle may be drawn, or stays as it is
-    order: Int[Array, " p"] | None = None  # which particle stands at each place
-    labels: Int[Array, " p"] | None = None  # the component of each place, M where it is empty
+    order: Int[Array, " p"] | None  # which particle stands at each place
+    labels: Int[Array, " p"] | None  # the component of each place, M where it is empty
 
     @property
     def components(self) -> Int[Array, " p"]:
@@ -131,9 +131,7 @@ class Line(NamedTuple):
         return positions, before < total
 
 
-def in_line(
-    mixture: ParticleMixture, stays: Bool[Array, " n"] | None = None, along_curve: bool = False
-) -> Line:
+def in_line(mixture: ParticleMixture, stays: Bool[Array, " n"] | None, along_curve: bool) -> Line:
     """The particles in line, within each component along a Hilbert curve or as they are.
 
     A weight may underflow to zero where its logarithm does not. Such a particle is not drawn where
@@ -143,7 +141,8 @@ def in_line(
     if m == 1 and not along_curve:
         weights = whole(mixture.component_weights, 0.0)
         log_masses = mixture.log_mixture_weights
-        return Line(n, weights, jnp.ones(1, weights.dtype), log_masses, weights > 0)
+        one = jnp.ones(1, weights.dtype)
+        return Line(n, weights, one, log_masses, weights > 0, order=None, labels=None)
     labels = mixture.component_indicators
     if stays is not None or along_curve:
         # Particles that stay by rank need their component's as neighbours.
