@@ -46,10 +46,6 @@ class Memory(eqx.Module):
     def check_past(self) -> None:
         """Raise a `ValueError` if some state has no past among the particles in any case."""
 
-    def warning(self) -> str:
-        """What a run that ends with this memory has to warn of; nothing by default."""
-        return ""
-
 
 def memories_of(memory: dict[str, PyTree]) -> dict[str, Memory]:
     """The entries that follow the particles, by name."""

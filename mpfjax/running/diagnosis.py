@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float
 
 from mpfjax.checks import warn
 from mpfjax.filter import Filter
-from mpfjax.memory import memories_of
 from mpfjax.moves.initial import SelectInitial
 from mpfjax.report import with_densities
 from mpfjax.running.results import FilterRun
@@ -34,9 +33,6 @@ def sound(run: FilterRun, free: bool = True) -> FilterRun:
     run = with_densities(run, increments)
     if isinstance(increments, Tracer):
         return run
-    for entry in memories_of(run.final.memory).values():
-        if text := entry.warning():
-            warn(text)
     degenerate = np.asarray(run.degenerate)
     is_blind = degenerate.any(axis=-1) & (degenerate | (np.asarray(increments) == 0)).all(axis=-1)
     if is_blind.any():
