@@ -151,7 +151,7 @@ BUGS = {
         "tests/smoothing/test_contracts.py -m 'not exactness' -k backward",
     ),
     "the variance of log Ẑ counts pairs for less": Bug(
-        "moves/eve_indices.py",
+        "smoothing/variance.py",
         "grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)",
         "grown = jnp.where(due & (k > 1), jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)",
         "tests/smoothing/test_variance.py",

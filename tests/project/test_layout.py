@@ -18,7 +18,7 @@ FLOORS = {
         logarithms islands stored matrices compiling random prefix_sums segments
     """,
     "moves": """
-        base eve_indices conditional every regrouping resampling propagation metropolis
+        base conditional every regrouping resampling propagation metropolis
         objects initial start
     """,
     "vision": "files colour tracking boxes",
