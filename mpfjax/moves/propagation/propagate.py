@@ -51,12 +51,7 @@ class Draw(AbstractPropagation):
         if proposal is None or is_missing(now):
             mixture = predict(key, now.model, mixture, self.gradient, self.noise)
             return mixture if is_missing(now) else self.reweight(mixture, now)
-        if self.noise == "independent":
-            draws, log_density = proposal.propose(key, now, previous)
-        else:
-            of_noise: Any = proposal
-            points = noise_of_slots(key, self.noise, of_noise.noise_dimension(previous), mixture)
-            draws, log_density = of_noise.propose_from_noise(points, now, previous)
+        draws, log_density = _propose(proposal, key, self.noise, mixture, now)
         check_moved(draws, law.part(previous), proposal, "propose")
         if self.gradient == "stop":
             draws, log_density = without_gradient((draws, log_density))
@@ -146,6 +141,17 @@ class Reweight(AbstractPropagation):
             return mixture
         states, log_factors = now.law.see(now.observation, mixture.particles)
         return mixture.replace(particles=states).reweight(*log_factors)
+
+
+def _propose(
+    proposal: Any, key: Key[Array, ""], noise: str, mixture: ParticleMixture, now: Step
+) -> tuple[PyTree, Float[Array, " n"]]:
+    """x_t of every particle, and log q of each."""
+    previous = mixture.particles
+    if noise == "independent":
+        return proposal.propose(key, now, previous)
+    points = noise_of_slots(key, noise, proposal.noise_dimension(previous), mixture)
+    return proposal.propose_from_noise(points, now, previous)
 
 
 def noise_of_slots(

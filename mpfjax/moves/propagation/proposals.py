@@ -35,7 +35,17 @@ class _Gaussian(NamedTuple):
 
 
 class ProposalOfNoise(AbstractProposal):
-    """A proposal that has `propose_from_noise`, by which it draws."""
+    """A proposal whose draws are functions of standard normal noise."""
+
+    @abc.abstractmethod
+    def noise_dimension(self, previous_states: Any) -> int:
+        """The number of normal numbers that a draw is made of."""
+
+    @abc.abstractmethod
+    def propose_from_noise(
+        self, noise: Float[Array, "n k"], now: Step, previous_states: Any
+    ) -> tuple[Any, Float[Array, " n"]]:
+        """x_t from this noise, and log q of each."""
 
     def propose(
         self, key: Key[Array, ""], now: Step, previous_states: Any

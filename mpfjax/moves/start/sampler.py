@@ -82,7 +82,8 @@ def sample_window(
     Raises `ValueError` where derivatives are asked for.
     """
     floats, others = eqx.partition((model, window), eqx.is_inexact_array)
-    sampler = _Sampler(*eqx.combine(_constant(floats), others), num_particles)
+    model, window = eqx.combine(_constant(floats), others)
+    sampler = _Sampler(model, window, num_particles)
     key_paths, key_steps = split(key, 2)
     steps = jnp.arange(window.length, dtype=jnp.int32), split(key_steps, window.length)
     paths, log_increments = jax.lax.scan(sampler.observe, sampler.first_paths(key_paths), steps)
