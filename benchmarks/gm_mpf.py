@@ -1,4 +1,4 @@
-"""Lin et al. (2012), figures 1 to 4 and table 1: PF, GPF, MPF and GM-MPF on two targets.
+"""Lin et al. (2012), figures 1 and 2, and table 1: PF, GPF, MPF and GM-MPF on two targets.
 
     python -m benchmarks.gm_mpf                       # pets09_s2l1, or a rendered scene
     python -m benchmarks.gm_mpf --sequence DIR --ids 3 5 --frames 1:80
@@ -8,7 +8,7 @@ second-order dynamics (eq. 4); boxes are cut into three bands and colours weighe
 surround, as the paper does not, since a whole box's histogram loses small pedestrians to the
 pavement whatever the filter. Those with one component hold both targets in it; the mixtures have
 one component for each target, which never meet but in their weights, as the paper's intervals.
-Into --out DIR go gm_mpf.json and the figures.
+Into --out DIR go gm_mpf.json and particle_migration.png.
 """
 
 import os
@@ -108,15 +108,7 @@ def main(
         harness.data(out / "gm_mpf.json", settings=settings, **content)
     print(f"\ntwo targets of {targets.name}, {seeds} seeds; the reference has N = {reference}")
     print(harness.table(COLUMNS, results))
-    curves = {
-        NAMES[name]: [*enumerate(step.effective_sample_size.mean(axis=0), targets.first)]
-        for name, step in steps.items()
-    }
-    sizes = plotting.Panel(f"mean of seeds, N = {particles[0]}", "frame", "N_eff, eq. 14", curves)
-    harness.figures(
-        out, dpi=130, particle_migration=draw_migration(steps, targets),
-        effective_sample_size=plotting.draw_panels([[sizes]], ("linear", "linear")),
-    )  # fmt: skip
+    harness.figures(out, dpi=130, particle_migration=draw_migration(steps, targets))
     print(f"written to {out}")
 
 

@@ -49,7 +49,6 @@ METHODS: dict[str, tuple[str, Callable[..., mpfjax.Filter]]] = {
     "adaptive_draws": ("adaptive partitions, K = 5", partial(adaptive, num_draws=5)),
     "crossing": ("one cluster", one_cluster),
     "clusters": ("clusters", mpfjax.clustered_particle_filter),
-    # Clusters that part after five steps without contact, an approximation.
 }
 ONE_BY_ONE = ("crossing", "clusters")
 

@@ -48,9 +48,7 @@ class Scene(NamedTuple):
 # --- synthetic --------------------------------------------------------------------------------
 
 # What `distracter_scene` leaves open, and the tracker's momentum, which the paper prints.
-DEFAULT: dict[str, Any] = {
-    "size": (24, 24), "speed": 0.0, "deviation": 4.0, "noise": "grey", "momentum": 0.5
-}  # fmt: skip
+DEFAULT: dict[str, Any] = {"size": (24, 24), "speed": 0.0, "momentum": 0.5}
 
 
 def synthetic_scenes(
@@ -73,10 +71,10 @@ def synthetic_scenes(
 
 
 def synthetic_scene(
-    key: int, *, momentum: float, size: tuple[int, int], only_if_kept: bool = False, **others: Any
+    key: int, *, momentum: float, size: tuple[int, int], speed: float, only_if_kept: bool = False
 ) -> Scene | None:
     """The seven objects of section 3.2 and their distracter; None where not to be kept."""
-    drawn = distracter_scene(jax.random.key(key), size=size, **others)
+    drawn = distracter_scene(jax.random.key(key), size=size, speed=speed)
     starts = drawn.boxes[0, :, :2] + drawn.boxes[0, :, 2:] / 2
     learned = vision.joint_colour_model(
         drawn.frames[0], drawn.boxes[0], templates={0: drawn.template}

@@ -12,13 +12,11 @@ from benchmarks.partitioned_sampling.tables import content_of
 
 LAMBDA = 20.0
 FILTERS = {"joint": "joint PF", "ps": "PS, mean of orders", "dps": "DPS"}
-OLD = {"size": (32, 40), "speed": 6.0, "deviation": 3.0, "noise": "colour", "momentum": 0.5}
 # What changes, by name and value.
 AXES: dict[str, dict[float, dict[str, Any]]] = {
     "objects' size [px]": {side: {"size": (side, side)} for side in (20, 24, 26, 28, 32)},
     "distracter's speed [px/frame]": {speed: {"speed": speed} for speed in (0.0, 2.0, 4.0, 6.0)},
     "tracker's momentum": {share: {"momentum": share} for share in (0.0, 0.5, 0.75, 1.0)},
-    "the scene whose distracter runs away": {0.0: OLD},
 }
 COLUMNS = {
     "what": "{axis}", "value": "{value:g}", "filter": "{filter}", "success": "{success:.0%}",

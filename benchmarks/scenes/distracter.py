@@ -1,15 +1,15 @@
 """The synthetic sequence of Smith and Gatica-Perez (2004), 3.2: seven objects and a distracter."""
 
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import NotNegative, Positive, checked, whole
+from mpfjax.checks import NotNegative, checked, whole
 
 _HEIGHT, _WIDTH = 288, 360
-_STEP_DEVIATION, _MOMENTUM = 3.0, 0.5  # of objects 2 to 7; all have the momentum
+_FIRST_DEVIATION, _STEP_DEVIATION, _MOMENTUM = 4.0, 3.0, 0.5  # of object 1, of the others, of all
 _STARTS = np.array(
     [[180, 144], [60, 58], [180, 52], [300, 58], [60, 230], [180, 236], [300, 230]], float
 )
@@ -33,7 +33,6 @@ _LOOKS = np.array(
     float,
 )
 _GRAIN = 14.0
-_NOISES = {"grey": 1, "colour": 3}  # channels of the background that are drawn
 
 
 class DistracterScene(NamedTuple):
@@ -65,8 +64,6 @@ def distracter_scene(
     *,
     size: tuple[int, int] = (24, 24),
     speed: NotNegative = 0.0,
-    deviation: Positive = 4.0,
-    noise: Literal["grey", "colour"] = "grey",
 ) -> DistracterScene:
     """Render seven objects on noise, and a distracter that lures the tracker of the first away.
 
@@ -76,24 +73,21 @@ def distracter_scene(
     from which object 1's histogram is learned (`template`), which appears over object 1 in frame 3,
     leads the tracker astray, and is gone in frame 9; and that object 1 is the quicker one. The rest
     is our choice, made so that tables 1 and 2 are reproduced: colours, places and sizes; that the
-    distracter stands still while object 1 walks away; and that object 1 is clear of it by 4 to 12
-    pixels in frame 8 and by 12 in the last frame. Paths are drawn again where two would meet or one
-    would leave the frame. The same key gives the same scene.
+    distracter stands still while object 1 walks away, by 4 ω_t in place of 3 ω_t; and that object 1
+    is clear of it by 4 to 12 pixels in frame 8 and by 12 in the last frame. Paths are drawn again
+    where two would meet or one would leave the frame. The same key gives the same scene.
 
     - `num_frames`: t, from 9 on.
     - `size`: width and height of every object, in pixels.
     - `speed`: of the distracter, in pixels a frame, in the direction opposite to object 1.
-    - `deviation`: of ω_t of object 1, in pixels, where the others have 3.
-    - `noise`: of the background, "grey" or "colour".
 
-    `size=(32, 40), speed=6.0, deviation=3.0, noise="colour"` is a scene whose distracter runs away.
     Raises `NoPath` where 20 000 tries find no path. Use it to see how a filter copes with a
     look-alike that leads it away.
     """
     sides = np.array(size, float)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
     others = _draw_others(rng, num_frames, sides)
-    first, bait = _draw_first(rng, others, sides, speed, deviation)
+    first, bait = _draw_first(rng, others, sides, speed)
     centres = np.concatenate([first[:, None], others, bait[:, None]], axis=1)
     corners = np.round(centres - sides / 2)
     boxes = np.concatenate([corners, np.broadcast_to(sides, corners.shape)], axis=-1)
@@ -103,7 +97,7 @@ def distracter_scene(
     patches = [_patch(rng, looks, sides.astype(int)) for looks in _LOOKS]
     frames = []
     for t in range(num_frames):
-        grain = rng.integers(0, 256, (_HEIGHT, _WIDTH, _NOISES[noise]), dtype=np.uint8)
+        grain = rng.integers(0, 256, (_HEIGHT, _WIDTH, 1), dtype=np.uint8)
         frame = np.broadcast_to(grain, (_HEIGHT, _WIDTH, 3)).copy()
         for box, patch in zip([*boxes[t], distracter[t]], patches, strict=True):
             if np.all(np.isfinite(box)):
@@ -124,12 +118,12 @@ def _draw_others(rng: np.random.Generator, num_frames: int, sides: np.ndarray) -
 
 
 def _draw_first(
-    rng: np.random.Generator, others: np.ndarray, sides: np.ndarray, speed: float, deviation: float
+    rng: np.random.Generator, others: np.ndarray, sides: np.ndarray, speed: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """(t, 2) each: the centres of object 1, and of the distracter that it leaves behind."""
     num_frames, last = len(others), _VANISHES - 2
     for _ in range(_TRIES // _AT_A_TIME):
-        first = _walks(rng, _STARTS[:1], deviation, num_frames)
+        first = _walks(rng, _STARTS[:1], _FIRST_DEVIATION, num_frames)
         bait = _lure(first, speed)
         gaps = np.max(np.abs(bait - first)[:, :, 0] - sides, axis=-1)
         parted = (gaps[:, last] >= _CLEAR[0]) & (gaps[:, last] <= _CLEAR[1])
@@ -141,7 +135,7 @@ def _draw_first(
             chosen = np.argmax(fits)
             return first[chosen, :, 0], bait[chosen, :, 0]
     raise NoPath(
-        "speed, deviation, num_frames: in no try is object 1 clear of the distracter by"
+        "speed, num_frames: in no try is object 1 clear of the distracter by"
         f" {_CLEAR[0]:g} to {_CLEAR[1]:g} pixels in frame 8, and all keep inside and apart"
     )
 

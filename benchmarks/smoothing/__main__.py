@@ -77,12 +77,6 @@ def main(
 # mode is one half at every time, exactly.
 
 
-def _auxiliary(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
-    proposal = mpfjax.GaussNewtonProposal()
-    plain = mpfjax.mixture_particle_filter(model, num_particles, 2)
-    return mpfjax.with_quasi_monte_carlo(mpfjax.with_lookahead(plain, proposal))
-
-
 def _guided(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
     proposal = mpfjax.GaussNewtonProposal()
     return mpfjax.mixture_particle_filter(model, num_particles, 2, proposal=proposal, noise="rqmc")
@@ -90,12 +84,8 @@ def _guided(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax
 
 FILTERS: dict[str, Callable[[mpfjax.AbstractStateSpaceModel, int], mpfjax.Filter]] = {
     "PF": mpfjax.particle_filter,
-    "multinomial PF": lambda model, num_particles: mpfjax.particle_filter(
-        model, num_particles, scheme="multinomial"
-    ),
     "MPF": lambda model, num_particles: mpfjax.mixture_particle_filter(model, num_particles, 2),
     "guided MPF": _guided,
-    "auxiliary MPF": _auxiliary,
 }
 
 

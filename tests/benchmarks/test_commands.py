@@ -16,7 +16,7 @@ from benchmarks.peers.__main__ import disagreement
 OF_VIDEO = "visual_tracking.json contact_sheet.png tracking.mp4 tracks_pf.txt tracks_mpf.txt"
 COMMANDS = {
     "first_result": "first_result.json",
-    "gm_mpf": "gm_mpf.json particle_migration.png effective_sample_size.png",
+    "gm_mpf": "gm_mpf.json particle_migration.png",
     "hand_written_c": "hand_written_c.json",
     "interacting_objects": "interacting_objects.json interacting_objects.png",
     "likelihood_tuning": (
