@@ -62,7 +62,7 @@ BUGS = {
         "tests/together/test_exact_answers.py -k slots",
     ),
     "PMMH accepts by the same number at every step": Bug(
-        "tuning/walks.py",
+        "tuning/densities.py",
         "jnp.log(jax.random.uniform(key_accept, (), gain.dtype)) < gain",
         "jnp.log(jax.random.uniform(jax.random.key(0), (), gain.dtype)) < gain",
         "tests/together/test_exact_answers.py -k chains",
@@ -82,8 +82,8 @@ BUGS = {
     ),
     "a checkpoint counts one step too many": Bug(
         "running/long_runs.py",
-        'notes = {"step": state.step, "identity": self.identity(state.step)}',
-        'notes = {"step": state.step + 1, "identity": self.identity(state.step)}',
+        'notes = {"step": state.step, "identity": self._identity(state.step)}',
+        'notes = {"step": state.step + 1, "identity": self._identity(state.step)}',
         "tests/running/test_storage.py -k LongRuns",
     ),
     # Filters, resampling and regrouping.

@@ -88,7 +88,7 @@ def test_paths_have_the_colour_of_their_mode(ax):
 
 def test_parameters_are_drawn_over_steps(ax):
     history = {"value": np.zeros(3), "a": np.arange(3.0), "b": np.ones((3, 2))}
-    tuned = TuningRun(None, {"a": np.array(2.0), "b": np.ones(2)}, 0.0, history, None)
+    tuned = TuningRun(None, {"a": np.array(2.0), "b": np.ones(2)}, 0.0, history, None, None)
     plotting.draw_tuning(tuned, ax=ax)
     assert [line.get_label() for line in ax.lines] == ["a", "b[0]", "b[1]"]
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,9 +22,14 @@ from mpfjax.running.storage import (
     write_described,
 )
 
+_CHECKPOINTS: ContextVar[tuple["Checkpoint", ...]] = ContextVar("checkpoints", default=())
+
 
 class Checkpoint(Checked):
     """The file from which a long run continues: `fit`, `maximise`, and the samplers of parameters.
+
+        with mpfjax.Checkpoint("fit.npz"):
+            run = fit(...)
 
     - `path`: a .npz file, without pickles. If it exists, the same call continues from it, with the
       result of an uninterrupted run, to the bit. The call may ask for more steps or observations.
@@ -38,6 +44,13 @@ class Checkpoint(Checked):
 
     path: str | os.PathLike[str]
     every: Count = 50
+
+    def __enter__(self) -> "Checkpoint":
+        _CHECKPOINTS.set((*_CHECKPOINTS.get(), self))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        _CHECKPOINTS.set(_CHECKPOINTS.get()[:-1])
 
 
 class State(NamedTuple):
@@ -58,16 +71,16 @@ class Broken(Exception):
 
 @dataclass(frozen=True)
 class LongRun:
-    """A run of the public function `caller`, up to a last step.
+    """A run of the public function `caller`, up to a last step, with the innermost `Checkpoint`.
 
-    `identity` describes all that has to be the same for a file to be of this run, up to a step.
+    `settings` are all numbers, arrays, modules and names that have to be the same for a file to be
+    of this run, up to a step. The code of functions is not compared.
     """
 
     caller: str
     last: int
-    checkpoint: Checkpoint | None
     progress: bool
-    identity: Callable[[int], Mapping[str, str]]
+    settings: Callable[[int], Mapping[str, Any]]
 
     def go(self, start: State, advance: Advance) -> tuple[State, str | None]:
         """The state after all steps, and why there are fewer, if there are.
@@ -77,7 +90,7 @@ class LongRun:
         raised, and what is broken at the start is a RuntimeError.
         """
         state = start if start.step else self._load(start) or start
-        every = self.last if self.checkpoint is None else self.checkpoint.every
+        every = self.last if self._checkpoint is None else self._checkpoint.every
         pieces, last_save, stopped = [state.rows], state.step, None
         bar = tqdm(total=self.last, initial=state.step, disable=not self.progress, unit="step")
         try:
@@ -104,40 +117,36 @@ class LongRun:
             warn(f"{self.caller}: {stopped}; its result is of the steps before", UserWarning)
         return state._replace(rows=_concatenate(pieces)), stopped
 
+    @property
+    def _checkpoint(self) -> Checkpoint | None:
+        return next(reversed(_CHECKPOINTS.get()), None)
+
+    def _identity(self, step: int) -> dict[str, str]:
+        """What the file of this run holds of it, up to a step, as text."""
+        return {"caller": self.caller} | describe_parts(**self.settings(step))
+
     def _save(self, state: State, pieces: list[PyTree]) -> PyTree:
         """All rows in one piece, written to the file with the state."""
         rows = _concatenate(pieces)
-        if self.checkpoint is not None:
+        if self._checkpoint is not None:
             arrays = arrays_of({"carry": state.carry, "rows": rows})
-            notes = {"step": state.step, "identity": self.identity(state.step)}
-            write_described(self.checkpoint.path, arrays, notes)
+            notes = {"step": state.step, "identity": self._identity(state.step)}
+            write_described(self._checkpoint.path, arrays, notes)
         return rows
 
     def _load(self, like: State) -> State | None:
         """The state that the file holds, None without a file; a `ValueError` for another run's."""
-        if self.checkpoint is None or not Path(self.checkpoint.path).exists():
+        if self._checkpoint is None or not Path(self._checkpoint.path).exists():
             return None
-        path = self.checkpoint.path
+        path = self._checkpoint.path
         arrays, notes = read_described(path)
         step, other = notes.get("step", 0), notes.get("identity", {})
-        identity = self.identity(step)
+        identity = self._identity(step)
         if other != identity:
             difference = differences(other, identity)
             raise ValueError(f"checkpoint: {path} is of another {self.caller}: {difference}")
         state = tree_of_arrays(path, arrays, {"carry": like.carry, "rows": like.rows})
         return State(step, state["carry"], state["rows"])
-
-
-def identity_of(
-    caller: str, checkpoint: Checkpoint | None, settings: dict[str, Any]
-) -> dict[str, str]:
-    """All that has to be the same for a file to belong to this run, as text.
-
-    `settings` are numbers, arrays, modules and names. The code of functions is not compared.
-    """
-    if checkpoint is None:
-        return {}
-    return {"caller": caller} | describe_parts(**settings)
 
 
 def _concatenate(pieces: list[PyTree]) -> PyTree:

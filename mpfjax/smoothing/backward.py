@@ -48,14 +48,11 @@ def draw(
 
 
 def draw_ends(
-    key: Key[Array, ""], mixtures: ParticleMixture, number: int, component: int | None
+    key: Key[Array, ""], mixtures: ParticleMixture, number: int
 ) -> tuple[Int[Array, " k"], PyTree]:
-    """Indices and states of particles of the last mixture by their weights, or of a component."""
+    """Indices and states of particles of the last mixture by their weights."""
     final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
-    log_weights = final.log_weights
-    if component is not None:
-        log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
-    indices = draw(key, (number,), log_weights)
+    indices = draw(key, (number,), final.log_weights)
     return indices, jax.tree.map(lambda leaf: take(leaf, indices), final.particles)
 
 
@@ -119,34 +116,25 @@ def walk(
     next_states: PyTree,
     mixture: ParticleMixture,
     start: Int[Array, " k"],
-    proposed: Int[Array, "steps k"],
+    proposed: Int[Array, " k"],
     needed: Bool[Array, " k"] | None = None,
-) -> Int[Array, "steps k"]:
-    """Steps of independent Metropolis-Hastings on the index, whose target is W^i D(next | x^i).
+) -> Int[Array, " k"]:
+    """A step of independent Metropolis-Hastings on the index, whose target is W^i D(next | x^i).
 
-    O(1) for a state and step; the index after each of the steps. `proposed` are draws by
-    the weights alone, which can all be made beforehand. The index is -1 as by `draw_exactly`.
+    O(1) for a state. `proposed` are draws by the weights alone, which can all be made beforehand.
+    The index is -1 as by `draw_exactly`.
     """
 
     def log_density(indices: Int[Array, " k"]) -> Float[Array, " k"]:
         previous = jax.tree.map(lambda leaf: take(leaf, indices), mixture.particles)
         return law_of(model).log_transition(next_states, previous)
 
-    def move(
-        place: tuple[Int[Array, " k"], Float[Array, " k"]],
-        inputs: tuple[Int[Array, " k"], Float[Array, " k"]],
-    ) -> tuple[tuple[Int[Array, " k"], Float[Array, " k"]], Int[Array, " k"]]:
-        (indices, current), (candidates, log_uniform) = place, inputs
-        new = log_density(candidates)
-        # The proposal draws by the weights, which therefore cancel in the acceptance ratio.
-        accepted = (log_uniform < new - current) | (current == -jnp.inf)
-        indices = jnp.where(accepted, candidates, indices)
-        return (indices, jnp.where(accepted, new, current)), indices
-
-    first = (start, log_density(start))
-    log_uniforms = jnp.log(uniform(key, proposed.shape, mixture.log_weights.dtype))
-    (_, current), indices = jax.lax.scan(move, first, (proposed, log_uniforms))
-    return _or_none(indices, current, needed)
+    current, new = log_density(start), log_density(proposed)
+    log_uniform = jnp.log(uniform(key, proposed.shape, mixture.log_weights.dtype))
+    # The proposal draws by the weights, which therefore cancel in the acceptance ratio.
+    accepted = (log_uniform < new - current) | (current == -jnp.inf)
+    indices = jnp.where(accepted, proposed, start)
+    return _or_none(indices, jnp.where(accepted, new, current), needed)
 
 
 def log_transitions(model: Any, trajectory: PyTree, inputs: PyTree) -> Float[Array, " t"]:

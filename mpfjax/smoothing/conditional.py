@@ -20,9 +20,8 @@ from mpfjax.operations.random import split, uniform
 from mpfjax.running.diagnosis import sound
 from mpfjax.running.results import FilterRun
 from mpfjax.running.scan import initial_keys, scan
-from mpfjax.smoothing.backward import draw, log_transitions
-from mpfjax.smoothing.history import ancestors_of, mixtures_of, paths_through
-from mpfjax.smoothing.trajectories import draw_trajectories
+from mpfjax.smoothing.backward import log_transitions
+from mpfjax.smoothing.trajectories import draw_trajectory
 
 _IMPOSSIBLE = "trajectory: its density beside the observations is zero or NaN"
 
@@ -49,8 +48,6 @@ def conditional_filter(
     filter: Filter,
     observations: PyTree,
     trajectory: PyTree,
-    *,
-    backward: bool = True,
 ) -> ConditionalRun:
     """Run a filter conditionally on a trajectory, and draw a new one from all its particles.
 
@@ -69,13 +66,10 @@ def conditional_filter(
     are functions of the particles (of all of them, including the retained one) and of independent
     random numbers, so that given the particles their distribution is the same for any retained
     slot, and cancels. K-means, merging and splitting move the trajectory from one component to
-    another like any particle. Both backward sampling and the genealogy then draw from the run
-    alone, regardless of which of its trajectories was retained.
+    another like any particle. Backward sampling then draws from the run alone,
+    regardless of which of its trajectories was retained.
 
     - `trajectory`: x_0, ..., x_t, leaves (t + 1, ...), such as one of `sample_trajectories`.
-    - `backward`: draw the new trajectory by backward sampling, which requires the model's
-      `log_transition`. Otherwise it is drawn from the genealogy, and differs from the old one only
-      in the last steps, unless N is large.
     - `observations`: arrays, or a `Series`.
 
     x_0 is drawn independently for each particle, even if the model would draw it in strata, and no
@@ -85,27 +79,23 @@ def conditional_filter(
     Raises `ValueError` for a filter that is not a chain of regrouping moves, `Resample`,
     `AuxiliaryResample`, `Propagate`, `Predict`, `Reweight` and `Every` of these, also initially; a
     conditionally linear model; a proposal without `log_density`; noise that is not independent; a
-    model without `log_transition`, unless `backward` is false; a trajectory of other shapes or
-    types than the model's states, or of density zero (NaN within jit). Use it in your own Gibbs
+    model without `log_transition`; a trajectory of other shapes or types than the model's states,
+    or of density zero (NaN within jit). Use it in your own Gibbs
     sampler; `mpfjax.tuning.particle_gibbs` is one for parameters.
     """
-    check_conditional(filter, backward, "conditional_filter")
+    check_conditional(filter, "conditional_filter")
     series = as_series(observations, filter.model)
     trajectory = _as_states(trajectory, filter.model, series.length + 1)
     # Checked before the run: backward sampling could not recover an impossible trajectory.
     possible = eqx.filter_jit(possible_times)(filter.model, trajectory, series.inputs)
     trajectory = refuse_where(~possible, trajectory, _IMPOSSIBLE)
-    result = _run(key, filter, series, trajectory, backward)
+    result = _run(key, filter, series, trajectory)
     result = eqx.tree_at(lambda result: result.run, result, sound(result.run, free=False))
     return refuse_where(~result.possible, result, _IMPOSSIBLE)
 
 
 def renew(
-    key: Key[Array, ""],
-    filter: Filter,
-    series: Series,
-    trajectory: PyTree,
-    backward: bool,
+    key: Key[Array, ""], filter: Filter, series: Series, trajectory: PyTree
 ) -> ConditionalRun:
     """`conditional_filter` under the caller's jit, its arguments unchecked.
 
@@ -129,9 +119,8 @@ def renew(
     slots = run.collected.memory[REFERENCE].slot
     log_weights = jax.vmap(at)(run.collected.log_weights, slots)
     is_alive = (log_weights > -jnp.inf) & ~run.degenerate
-    new = draw_trajectory(key_back, filter.model, run, series.inputs, backward)
     return ConditionalRun(
-        trajectory=new,
+        trajectory=draw_trajectory(key_back, filter.model, run, series.inputs),
         run=run,
         slots=jnp.concatenate([first_slot[None], slots]),
         possible=possible_times(filter.model, trajectory, series.inputs).at[1:].min(is_alive),
@@ -141,42 +130,22 @@ def renew(
 _run = jit_with_floats_traced(renew)
 
 
-def draw_trajectory(
-    key: Key[Array, ""],
-    model: AbstractStateSpaceModel,
-    run: FilterRun,
-    inputs: PyTree,
-    backward: bool,
-) -> PyTree:
-    """One trajectory of a run, by backward sampling or the genealogy: leaves (t + 1, ...)."""
-    mixtures = mixtures_of(run)
-    if backward:
-        paths, _ = draw_trajectories(key, model, mixtures, inputs, 1)
-    else:
-        end = draw(key, (1,), mixtures.log_weights[-1])
-        paths = paths_through(mixtures, ancestors_of(end, mixtures))
-    return jax.tree.map(lambda leaf: leaf[0], paths)
-
-
 def possible_times(model: Any, trajectory: PyTree, inputs: PyTree) -> Bool[Array, " t"]:
     """At which times a trajectory has a density above zero, as far as the densities tell.
 
     The observations have no part in it.
     """
-    length = jax.tree.leaves(trajectory)[0].shape[0]
-    start, later = jnp.ones(1, bool), jnp.ones(length - 1, bool)
+    start = jnp.ones(1, bool)
     if callable(getattr(model, "log_initial", None)):
         start = model.log_initial(jax.tree.map(lambda leaf: leaf[:1], trajectory)) > -jnp.inf
-    if callable(getattr(model, "log_transition", None)):
-        later = log_transitions(model, trajectory, inputs) > -jnp.inf
+    later = log_transitions(model, trajectory, inputs) > -jnp.inf
     return jnp.concatenate([start, later])
 
 
-def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
+def check_conditional(filter: Filter, needed_by: str) -> None:
     """Raise a `ValueError` for a filter that cannot keep a trajectory."""
     refuse_marginalised(filter.model, needed_by, "metropolis_hastings and smc2 take it as it is")
-    if backward:
-        require(filter.model, "log_transition", f"backward sampling in {needed_by}")
+    require(filter.model, "log_transition", needed_by)
     reference = Reference(None, jnp.zeros((), jnp.int32))
     for move in filter.initial_moves:
         # What selects x_0 exactly is left out.

@@ -61,7 +61,7 @@ def check_marginalised(
 
 
 @jit_on_wide_vectors
-def sample_marginalised(key, model, mixtures, observations, inputs, num_trajectories, component):
+def sample_marginalised(key, model, mixtures, observations, inputs, num_trajectories):
     """Latents z_0, ..., z_t given y_1..y_t, and the moments of x_0, ..., x_t given both.
 
     Also the indices of their particles, (t + 1, k). `mixtures` are those of x_0, ..., x_t; `inputs`
@@ -69,7 +69,7 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     """
     key_last, key_steps = split(key, 2)
     length = mixtures.log_weights.shape[0] - 1
-    last, end = draw_ends(key_last, mixtures, num_trajectories, component)
+    last, end = draw_ends(key_last, mixtures, num_trajectories)
 
     def back(carry: tuple[PyTree, Information], step: Any) -> tuple[Any, Any]:
         latent, future = carry

@@ -35,7 +35,7 @@ from mpfjax.smoothing.backward import (
     rows_at,
     walk,
 )
-from mpfjax.smoothing.history import NO_PAST
+from mpfjax.smoothing.trajectories import NO_PAST
 
 # Particles drawn for each particle's past. With one, few distinct particles of early times are
 # left, as in a genealogy; two are enough (Olsson and Westerborn 2017).
@@ -46,17 +46,11 @@ class SmoothedSums(eqx.Module):
     """Smoothed expectations of a sum over the trajectory, at each step.
 
     - `sums`: leaves (t, ...), at step s the estimate of E[Σ_{r <= s} h(x_{r-1}, x_r) | y_1..y_s].
-      With a lag, the sum of the first s of `terms`.
-    - `terms`: leaves (t, ...), the estimates of E[h(x_{r-1}, x_r) | y_1..y_{min(r + lag, t)}] for
-      every r; None without a lag.
     - `run`: the `FilterRun`, with nothing collected.
-    - `variances`: the variances of h, in the same form as `terms`; None without a lag.
     """
 
     sums: PyTree
-    terms: PyTree
     run: FilterRun
-    variances: PyTree = None
 
 
 @checked
@@ -66,7 +60,6 @@ def smoothed_sums(
     observations: PyTree,
     function: Callable[[PyTree, PyTree], PyTree],
     *,
-    lag: CountOrZero | None = None,
     method: Literal["exact", "mcmc"] = "exact",
 ) -> SmoothedSums:
     """E[Σ_t h(x_{t-1}, x_t) | y], online: PaRIS, in memory that does not grow with t.
@@ -81,9 +74,6 @@ def smoothed_sums(
     - `function`: h. Its arguments are x_{t-1} and x_t of n particles, leaves (n, ...), and it
       returns values for each, leaves (n, ...); of one particle if the model is wrapped by
       `per_particle`.
-    - `lag`: L. None smooths every term by all observations so far. With a lag, term r is smoothed
-      by y_1..y_{r+L} and then final. Memory is L + 1 times as large. The bias does not vanish with
-      N, but the variance does not grow with t - r. A lag of t or more is a lag of t - 1.
     - `method`: "exact" weights all N particles, O(N²) per step. "mcmc" (Dau and Chopin 2023) starts
       at the ancestor and continues by steps of independent Metropolis-Hastings, O(N), and is as
       accurate.
@@ -92,55 +82,38 @@ def smoothed_sums(
     Raises `ValueError` for a model without `log_transition`, values that are not one per particle,
     "mcmc" if a move leaves no single ancestors, and as `run_filter` does; a RuntimeError if no
     particle can have moved to the next. Use it for the sums that scores and EM require, and for
-    series that are too long to store. `sample_trajectories` requires the mixtures of all steps, and
-    serves every function at once.
+    series that are too long to store; `FixedLagSmoother` estimates the terms. `sample_trajectories`
+    requires the mixtures of all steps, and serves every function at once.
     """
     series = as_series(observations, filter.model)
-    if lag is not None:
-        lag = min(lag, series.length - 1)
-    smoother = FixedLagSmoother(filter, function, lag or 0, method)
-    sums = _smooth(key, smoother, series, lag)
+    sums = _smooth(key, FixedLagSmoother(filter, function, 0, method), series)
     sums = eqx.tree_at(lambda sums: sums.run, sums, sound(sums.run))
     _check_sums(sums.sums)
     return sums
 
 
 @jit_with_floats_traced
-def _smooth(key, smoother, series, lag):
+def _smooth(key, smoother, series):
     # The first two are those of `run_filter`.
     key_initial, key_steps, key_backward = split(key, 3)
-    length, filter, num_rows = series.length, smoother.filter, smoother.lag + 1
-    step_keys = jax.random.split(key_steps, length)
+    length, filter = series.length, smoother.filter
     initial = first_mixture(key_initial, filter, series)
     check_past(initial.memory)
+    # One row, of the sums so far.
     terms = smoother._no_terms(initial.particles)
 
     def advance(carry: tuple[ParticleMixture, "Terms"], step: PyTree) -> Any:
         mixture, terms = carry
-        t, step_key, draw_key, now = step
+        step_key, draw_key, now = step
         moved, info = step_or_predict(filter, step_key, mixture, now)
         terms, values = smoother._of_pasts(draw_key, now.inputs, mixture, moved, terms)
-        if lag is None:
-            means = jax.tree.map(lambda old, new: old + new[None], terms.means, values.means)
-            terms = terms._replace(means=means)
-        else:
-            terms = jax.tree.map(lambda old, new: old.at[t % num_rows].set(new), terms, values)
-        # The sum, or term t - lag, which the next step overwrites; zero while there is none yet.
-        final_terms = terms.row((t + 1) % num_rows).estimates_in(moved)
-        return (moved, terms), (final_terms, report_of(info))
+        means = jax.tree.map(lambda old, new: old + new[None], terms.means, values.means)
+        sums = jax.tree.map(lambda leaf: moved.expectation(leaf[0]), means)
+        return (moved, terms._replace(means=means)), (sums, report_of(info))
 
-    keys = step_keys, jax.random.split(key_backward, length)
-    steps = (jnp.arange(length, dtype=jnp.int32), *keys, series)
-    (final, terms), (final_terms, reports) = jax.lax.scan(advance, (initial, terms), steps)
-    run = run_of(initial, final, None, reports)
-    if lag is None:
-        return SmoothedSums(final_terms.means, None, run)
-    rest = jax.vmap(lambda r: terms.row(r).estimates_in(final))(
-        np.arange(length - lag, length) % num_rows
-    )
-    estimates = jax.tree.map(lambda a, b: jnp.concatenate([a[lag:], b]), final_terms, rest)
-    sums = jax.tree.map(lambda means: jnp.cumsum(means, axis=0), estimates.means)
-    return SmoothedSums(sums, estimates.means, run, estimates.variances)
+    steps = jax.random.split(key_steps, length), jax.random.split(key_backward, length), series
+    (final, _), (sums, reports) = jax.lax.scan(advance, (initial, terms), steps)
+    return SmoothedSums(sums, run_of(initial, final, None, reports))
 
 
 class Terms(NamedTuple):
@@ -275,10 +248,9 @@ class FixedLagSmoother(Checked):
             indices = draw_exactly(key, log_kernel, moved.particles, mixture, _DRAWS, needed)
         else:
             key_proposed, key_walk = split(key, 2)
-            shape = (_DRAWS - 1, start.shape[0])  # the start counts as a draw
-            proposed = draw(key_proposed, shape, mixture.log_weights)
-            later = walk(key_walk, model, moved.particles, mixture, start, proposed, needed).T
-            indices = jnp.concatenate([start[:, None], later], axis=1)
+            proposed = draw(key_proposed, start.shape, mixture.log_weights)
+            later = walk(key_walk, model, moved.particles, mixture, start, proposed, needed)
+            indices = jnp.stack([start, later], axis=1)  # the start counts as a draw
         places = jnp.where((moved.began_anew & needed)[:, None], -1, indices).reshape(-1)
         earlier = rows_at(places, mixture.particles)
         repeat = partial(jnp.repeat, repeats=_DRAWS, axis=0)

@@ -1,23 +1,25 @@
-"""Backward sampling: whole trajectories from their distribution given all observations."""
+"""Whole trajectories of a run: the genealogy of its particles, and backward sampling."""
 
 from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import Count, CountOrZero, checked, warn
+from mpfjax.checks import Count, checked, warn
 from mpfjax.filter import Filter
-from mpfjax.mixture import ParticleMixture
+from mpfjax.memory import check_past
+from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, require, with_inputs
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
-from mpfjax.models.observations import refusal_of
+from mpfjax.models.observations import refusal_of, refuse_where
 from mpfjax.models.series import present_steps, rows_of, series_of, steps_of_inputs, with_gaps
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
-from mpfjax.operations.stored import take
+from mpfjax.operations.stored import count_places, take
 from mpfjax.running.results import FilterRun
 from mpfjax.smoothing.backward import (
     append_last,
@@ -29,11 +31,114 @@ from mpfjax.smoothing.backward import (
     rows_at,
     walk,
 )
-from mpfjax.smoothing.history import mixtures_of, with_parents
 from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
+NO_PAST = "a state that began anew steps before, as with restarts, has no past among the particles"
 # Below this share of distinct states estimates of the past are poor, however many are drawn.
 _SMALL_SHARE = 0.1
+
+
+def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
+    """The stacked mixtures of a run; with those of a whole `FilterRun` x_0 comes first.
+
+    Raises `ValueError` for anything but a stack of mixtures, for a stack of several runs, and where
+    states began anew (NaN within a caller's jit).
+    """
+    is_run = isinstance(run, FilterRun)
+    mixtures = run.collected if is_run else run
+    if not isinstance(mixtures, ParticleMixture) or mixtures.log_weights.ndim != 2:
+        raise ValueError("mixtures: not those of a whole run; run the filter with collect=None")
+    check_past(mixtures.memory)
+    # Smoothing does not use the moves' memory, whose leaves may not stack.
+    mixtures = jax.vmap(lambda mixture: mixture.replace(memory={}))(mixtures)
+    began_anew = jax.vmap(lambda mixture: mixture.began_anew)(mixtures)
+    began_anew &= mixtures.log_weights > -jnp.inf
+    mixtures = refuse_where(jnp.any(began_anew), mixtures, f"mixtures: {NO_PAST}")
+    if not is_run:
+        return mixtures
+    initial = run.initial.replace(memory={})
+    return jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None].astype(rest.dtype), rest]),
+        initial,
+        mixtures,
+    )
+
+
+def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:
+    """The mixtures; an error where a particle comes from no single one of the step before."""
+    is_orphan = (mixtures.ancestor_indices < 0) & (mixtures.log_weights > -jnp.inf)
+    what = "follows ancestors, and particles of index below 0 have no single one, as after restarts"
+    return refuse_where(jnp.any(is_orphan[1:]), mixtures, f"mixtures: {needed_by} {what}")
+
+
+def ancestors_of(particles: Int[Array, " k"], mixtures: ParticleMixture) -> Int[Array, "t k"]:
+    """The slots of the ancestors of some particles of the last mixture, at every time."""
+
+    def back(indices: Array, ancestors: Array) -> tuple[Array, Array]:
+        return take(ancestors, indices), indices
+
+    parents = mixtures.ancestor_indices[1:]
+    first, later = jax.lax.scan(back, particles, parents, reverse=True)
+    return jnp.concatenate([first[None], later])
+
+
+def paths_through(mixtures: ParticleMixture, indices: Int[Array, "t k"]) -> PyTree:
+    """The states in these slots, leaves (k, t, ...); latents of particles that carry moments."""
+
+    def states(mixture: ParticleMixture, slots: Int[Array, " k"]) -> PyTree:
+        states = mixture.particles
+        states = states.latent if isinstance(states, MarginalisedState) else states
+        return jax.tree.map(lambda leaf: take(leaf, slots), states)
+
+    return jax.vmap(states, out_axes=1)(mixtures, indices)
+
+
+class Genealogy(eqx.Module):
+    """The ancestors of the final particles, at every time of a run.
+
+    - `indices`: (t, n), the slot of each particle's ancestor; at the last time its own.
+    - `trajectories`: leaves (n, t, ...), the states of the ancestors: a genealogical trajectory has
+      the weight of its particle in the final mixture. For a conditionally linear model these are
+      the latents, because the moments of an ancestor are filtering moments.
+    - `share_apart`: (m, t), the number of distinct ancestors of each component's particles, divided
+      by the number of particles: 1 if all are distinct, 1/count if one is left, and zero for an
+      empty component.
+    """
+
+    indices: Int[Array, "t n"]
+    trajectories: PyTree
+    share_apart: Float[Array, "m t"]
+
+
+@checked
+def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
+    """Trace the ancestor indices of a run back from its last step.
+
+    `mixtures` is a run of `run_filter(..., collect=None)`, whose first time is then x_0, or the
+    mixtures that it collected, whose first time is x_1. Raises `ValueError` for anything else, and
+    if particles have no single ancestors, as after restarts (an index below 0; NaN within
+    jit). Use it to see how far back the history of a mode reaches. Resampling leaves few ancestors
+    at early times; `sample_trajectories` draws new ones.
+    """
+    return _trace(with_parents(mixtures_of(mixtures), "trace_ancestors"))
+
+
+@eqx.filter_jit
+def _trace(mixtures: ParticleMixture) -> Genealogy:
+    final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
+    n, m = final.num_particles, final.num_components
+    indices = ancestors_of(jnp.arange(n, dtype=jnp.int32), mixtures)
+
+    def num_ancestors(ancestors: Array) -> Array:
+        # Empty slots are counted as a component of their own.
+        labels = jnp.where(final.occupied, final.component_indicators, m)
+        named = count_places(labels * n + ancestors, (m + 1) * n).reshape(m + 1, n)
+        return jnp.sum(named[:m] > 0, axis=1, dtype=jnp.int32)
+
+    apart = jax.lax.map(num_ancestors, indices).T
+    share = apart / jnp.maximum(final.component_counts, 1)[:, None]
+    share = share.astype(final.log_weights.dtype)
+    return Genealogy(indices, paths_through(mixtures, indices), share)
 
 
 @checked
@@ -43,9 +148,7 @@ def sample_trajectories(
     mixtures: FilterRun | ParticleMixture,
     num_trajectories: Count,
     *,
-    component: CountOrZero | None = None,
     method: Literal["exact", "mcmc"] = "exact",
-    num_moves: Count = 1,
     inputs: PyTree = None,
     observations: PyTree = None,
 ) -> PyTree:
@@ -60,12 +163,10 @@ def sample_trajectories(
     - `mixtures`: a run of `run_filter(..., collect=None)`, or the mixtures that it collected.
     - `num_trajectories`: k. Leaves of the result are (k, t + 1, ...); (k, t, ...), without x_0, for
       mixtures alone.
-    - `component`: draw x_t from this component of the last mixture only: the past of one mode.
     - `method`: "exact" weights all N particles, O(N) per trajectory and step. "mcmc" (Dau and
-      Chopin 2023) starts at the ancestor of x_{s+1} and makes `num_moves` steps of independent
-      Metropolis-Hastings, with proposals by W_s: O(1) per trajectory and step. It becomes as
+      Chopin 2023) starts at the ancestor of x_{s+1} and makes a step of independent
+      Metropolis-Hastings, with a proposal by W_s: O(1) per trajectory and step. It becomes as
       accurate as N grows.
-    - `num_moves`: of "mcmc".
     - `inputs`: u_1, ..., u_t, the known inputs of the run, unless a `Series` contains them.
     - `observations`: y_1..y_t, arrays or a `Series`, required by a conditionally linear model and
       by no other; a NaN is a missing number. Backward sampling is then the method of Lindsten,
@@ -73,13 +174,13 @@ def sample_trajectories(
       `MarginalisedState` of them with the mean and the covariance of each x_s given these and
       y_1..y_t. It requires a whole run, with x_0, and method "exact".
 
-    Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
-    that does not exist or is empty, a run with restarts, and for "mcmc" if particles have no single
-    ancestors (an index below 0); a RuntimeError if no particle can have moved to the next. Within
-    a caller's jit, states are NaN in place of these errors. If the backward weights degenerate, so
-    that at some time fewer than a tenth of the trajectories are distinct, a RuntimeWarning reports
-    the fraction. Use it for estimates of the past. The genealogy of the particles
-    (`trace_ancestors`) is exact as well, but has few distinct states at early times.
+    Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a run with
+    restarts, and for "mcmc" if particles have no single ancestors (an index below 0); a
+    RuntimeError if no particle can have moved to the next. Within a caller's jit, states are NaN in
+    place of these errors. If the backward weights degenerate, so that at some time fewer than a
+    tenth of the trajectories are distinct, a RuntimeWarning reports the fraction. Use it for
+    estimates of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but
+    has few distinct states at early times.
     """
     model = filter.model if isinstance(filter, Filter) else filter
     if not isinstance(filter, Filter):
@@ -96,41 +197,31 @@ def sample_trajectories(
     else:
         inputs = steps_of_inputs(inputs, length, model, "mixtures")
         inputs = jax.tree.map(lambda leaf: leaf[1:], inputs)
-    if component is not None:
-        _check_component(stacked, component)
     if is_marginalised(model) or observations is not None:
         observations = rows_of(observations)
         present = present_steps(observations, series, refusal_of(model))
         observations = with_gaps(observations, present)
         check_marginalised(model, stacked, observations, method)
         paths, indices = sample_marginalised(
-            key, model, stacked, observations, inputs, num_trajectories, component
+            key, model, stacked, observations, inputs, num_trajectories
         )
     else:
         if method == "mcmc":
             stacked = with_parents(stacked, "sample_trajectories with method 'mcmc', not 'exact',")
-        options = (num_trajectories, component, 0 if method == "exact" else num_moves)
-        paths, indices = draw_trajectories(key, model, stacked, inputs, *options)
+        paths, indices = draw_trajectories(key, model, stacked, inputs, num_trajectories, method)
     check_pasts(indices)
     _warn_of_few(indices, stacked)
     return paths
 
 
-def _check_component(mixtures: ParticleMixture, component: int) -> None:
-    active = jax.tree.map(lambda leaf: leaf[-1], mixtures).active
-    alive = range(component + 1) if isinstance(active, Tracer) else np.flatnonzero(active).tolist()
-    if component not in alive:
-        raise ValueError(f"component: {component} is empty at the last step; active are {[*alive]}")
-
-
 @jit_on_wide_vectors
-def draw_trajectories(key, model, mixtures, inputs, num_trajectories, component=None, num_moves=0):
+def draw_trajectories(key, model, mixtures, inputs, num_trajectories, method):
     """`sample_trajectories` without its checks of arguments, and the particles' indices, (t, k).
 
     `inputs` are those of the steps between mixtures; indices are -1 as by `draw_exactly`.
     """
     key_final, key_steps, key_proposed = split(key, 3)
-    last, states = draw_ends(key_final, mixtures, num_trajectories, component)
+    last, states = draw_ends(key_final, mixtures, num_trajectories)
 
     def back(carry: tuple[PyTree, Array], step: Any) -> tuple[tuple[PyTree, Array], PyTree]:
         next_states, next_indices = carry
@@ -142,23 +233,35 @@ def draw_trajectories(key, model, mixtures, inputs, num_trajectories, component=
             indices = draws[:, 0]
         else:
             start = take(ancestors, jnp.maximum(next_indices, 0))
-            indices = walk(step_key, model_now, next_states, earlier, start, proposed)[-1]
+            indices = walk(step_key, model_now, next_states, earlier, start, proposed)
         states = rows_at(indices, earlier.particles)
         return (states, indices), (states, indices)
 
     num_earlier = mixtures.log_weights.shape[0] - 1
     earlier = jax.tree.map(lambda leaf: leaf[:-1], mixtures)
     ancestors, proposed = mixtures.ancestor_indices[1:], None
-    if num_moves > 0:
+    if method == "mcmc":
         # All times in one go, since proposals do not depend on the states after them.
-        keys = jax.random.split(key_proposed, num_earlier)
-        shape = (num_moves, num_trajectories)
+        keys, shape = jax.random.split(key_proposed, num_earlier), (num_trajectories,)
         proposed = jax.vmap(lambda key, logs: draw(key, shape, logs))(keys, earlier.log_weights)
     keys = jax.random.split(key_steps, num_earlier)
     steps = (keys, earlier, ancestors, proposed, inputs)
     _, past = jax.lax.scan(back, (states, last), steps, reverse=True)
     states, indices = append_last(past, (states, last))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states), indices
+
+
+def draw_trajectory(
+    key: Key[Array, ""], model: AbstractStateSpaceModel, run: FilterRun, inputs: PyTree
+) -> PyTree:
+    """One trajectory of a run, leaves (t + 1, ...); from the genealogy without `log_transition`."""
+    mixtures = mixtures_of(run)
+    if callable(getattr(model, "log_transition", None)):
+        paths, _ = draw_trajectories(key, model, mixtures, inputs, 1, "exact")
+    else:
+        end = draw(key, (1,), mixtures.log_weights[-1])
+        paths = paths_through(mixtures, ancestors_of(end, mixtures))
+    return jax.tree.map(lambda leaf: leaf[0], paths)
 
 
 def _warn_of_few(indices: Int[Array, "t k"], mixtures: ParticleMixture) -> None:

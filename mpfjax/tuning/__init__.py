@@ -6,9 +6,8 @@ from mpfjax.tuning.bijections import Simplex as Simplex
 from mpfjax.tuning.comparison import compare_evidence as compare_evidence
 from mpfjax.tuning.curvature import standard_errors as standard_errors
 from mpfjax.tuning.densities import log_density as log_density
-from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
-from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
-from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
+from mpfjax.tuning.mcmc import metropolis_hastings as metropolis_hastings
+from mpfjax.tuning.mcmc import particle_gibbs as particle_gibbs
 from mpfjax.tuning.optimisation import fit as fit
 from mpfjax.tuning.optimisation import maximise as maximise
 from mpfjax.tuning.sequential import smc2 as smc2

@@ -14,10 +14,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import Checked, Count, CountOrZero, warn
+from mpfjax.checks import Count, CountOrZero, warn
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.running.long_runs import Checkpoint, LongRun, State, identity_of
-from mpfjax.tuning.densities import SamplePrior, chosen, drawn
+from mpfjax.running.long_runs import LongRun, State
+from mpfjax.tuning.densities import RandomWalk, SamplePrior, chosen, drawn, random_walk
 from mpfjax.tuning.problem import Problem, Reals
 from mpfjax.tuning.summaries import (
     effective_sample_size,
@@ -26,7 +26,6 @@ from mpfjax.tuning.summaries import (
     split_r_hat,
     table,
 )
-from mpfjax.tuning.walks import RandomWalk, random_walk
 
 _MOST_DRAWS_OF_A_START = 100
 # A program holds at most this many draws, or bytes of them, before they leave the device.
@@ -44,15 +43,13 @@ class PosteriorOfChains:
     """by name, on their own scale: shape (chains, draws, ...)."""
     accepted: Float[np.ndarray, "chains draws"] | Bool[np.ndarray, "chains draws"]
     """which of these steps moved, or the share of their Metropolis steps that did."""
-    stopped: str | None = None
+    stopped: str | None
     """why they ended before `num_steps`, or None."""
-    num_invalid: dict[str, np.ndarray] = field(default_factory=dict)
+    num_invalid: dict[str, np.ndarray]
     """by density: how often in each chain it was NaN or +inf, in all its steps."""
-    proposal_covariance: Float[np.ndarray, "d d"] | None = None
-    """of the random walk after burn-in, in unconstrained numbers, in the order of their names."""
-    problem: Problem | None = field(default=None, repr=False, compare=False)
+    problem: Problem = field(compare=False)
     """what was sampled: the filter, its parameters and the observations."""
-    one_start: bool = False
+    one_start: bool
     """whether several chains started at the same parameters, so that R-hat means nothing."""
 
     @property
@@ -114,7 +111,8 @@ class Chains(eqx.Module):
     num_invalid: dict[str, Int[Array, " chains"]]
 
 
-class Sampling(Checked):
+@dataclass(frozen=True)
+class Sampling:
     """Chains on the parameters of a problem, for the public function `caller`."""
 
     caller: str
@@ -125,42 +123,28 @@ class Sampling(Checked):
     num_chains: Count
     sample_prior: SamplePrior | None
     burn_in: CountOrZero
-    thinning: Count
-    checkpoint: Checkpoint | None
     progress: bool
 
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        if self.thinning > self.num_steps:
-            raise ValueError(f"thinning: {self.thinning} is more than num_steps, {self.num_steps}")
-
-    def run(
-        self, kernel: AbstractKernel, settings: dict[str, Any]
-    ) -> tuple[list[PyTree], dict[str, Any]]:
-        """What reports hold beside the parameters, leaves (chains, draws, ...), and other fields.
-
-        `settings` are those of `identity_of`.
-        """
-        settings = self.problem.settings | settings | {
-            "proposal_deviations": self.deviations, "key": self.key, "burn_in": self.burn_in,
-            "num_chains": self.num_chains, "thinning": self.thinning,
+    def run(self, kernel: AbstractKernel) -> tuple[list[PyTree], dict[str, Any]]:
+        """What reports hold besides parameters, leaves (chains, draws, ...), and other fields."""
+        settings = self.problem.settings | {
+            "observations": self.problem.objective, "proposal_deviations": self.deviations,
+            "key": self.key, "burn_in": self.burn_in, "num_chains": self.num_chains,
         }  # fmt: skip
-        identity = identity_of(self.caller, self.checkpoint, settings)
-        num_draws = self.num_steps // self.thinning
-        last = self.burn_in + num_draws * self.thinning
-        run = LongRun(self.caller, last, self.checkpoint, self.progress, lambda step: identity)
+        last = self.burn_in + self.num_steps
+        run = LongRun(self.caller, last, self.progress, lambda step: settings)
         key_starts, key_steps = jax.random.split(self.key)
         chains, none = self._start_chains(kernel, key_starts)
         advance = self._advance(kernel, key_steps, none)
         state, stopped = run.go(State(0, chains, none), advance)
-        reals, *rest = jax.tree.map(lambda rows: np.moveaxis(rows[:num_draws], 0, 1), state.rows)
+        draws = jax.tree.map(lambda rows: rows[: self.num_steps], state.rows)
+        reals, *rest = jax.tree.map(lambda rows: np.moveaxis(rows, 0, 1), draws)
         num_invalid = jax.tree.map(np.asarray, state.carry.num_invalid)
         warn_of_invalid(self.caller, num_invalid)
-        factor = np.asarray(state.carry.walk.factor)
         return rest, {
             "parameters": self.problem.constrained_rows(reals), "problem": self.problem,
-            "proposal_covariance": factor @ factor.T, "num_invalid": num_invalid,
-            "stopped": stopped, "one_start": self.num_chains > 1 and self.sample_prior is None,
+            "num_invalid": num_invalid, "stopped": stopped,
+            "one_start": self.num_chains > 1 and self.sample_prior is None,
         }  # fmt: skip
 
     def _starts(
@@ -198,30 +182,26 @@ class Sampling(Checked):
             raise RuntimeError(f"{self.caller}: the prior or likelihood was NaN or inf at {where}")
         return chains, jax.tree.map(np.asarray, none)
 
-    def _num_draws(self, step: int) -> int:
-        """How many draws there are after some steps."""
-        return max(step - self.burn_in, 0) // self.thinning
-
     def _advance(
         self, kernel: AbstractKernel, key: Key[Array, ""], none: PyTree
     ) -> Callable[..., Any]:
         """Some steps of all chains, about as many as take half a second; `none` are no reports."""
         length = 1
         size = 8 * sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves(none))
-        capacity = max(2, min(_MOST_DRAWS_AT_ONCE, _MOST_BYTES_AT_ONCE // max(size, 1)))
+        capacity = max(1, min(_MOST_DRAWS_AT_ONCE, _MOST_BYTES_AT_ONCE // max(size, 1)))
 
         def advance(step: int, last: int, chains: Chains) -> tuple[int, Chains, PyTree]:
             nonlocal length
             last = min(step + length, last)
             began = time.monotonic()
-            numbers = jnp.array([step, last, self.burn_in, self.thinning], jnp.int32)
+            numbers = jnp.array([step, last, self.burn_in], jnp.int32)
             chains, buffers = _steps(kernel, key, chains, numbers, capacity)
-            new = self._num_draws(last) - self._num_draws(step)
+            new = max(last - max(step, self.burn_in), 0)
             # Waits for the program, so that an interruption comes before anything is taken over.
             rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:new], buffers)
             seconds = time.monotonic() - began
             if seconds < _SECONDS_BETWEEN / 2:
-                length = min(2 * length, (capacity - 1) * self.thinning)
+                length = min(2 * length, capacity)
             elif seconds > 2 * _SECONDS_BETWEEN:
                 length = max(1, length // 2)
             return last, chains, rows
@@ -256,10 +236,9 @@ def _all_steps(kernel: Any, key: Key[Array, ""], chains: Chains, step: Any) -> S
 @jit_on_wide_vectors
 def _steps(kernel, key, chains, numbers, capacity):
     """Some steps of all chains, and their draws: one program for any number of steps."""
-    first, last, burn_in, thinning = numbers
+    first, last, burn_in = numbers
     report = eqx.filter_eval_shape(_all_steps, kernel, key, chains, 0).report
     buffers = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), report)
-    before = jnp.maximum(first - burn_in, 0) // thinning
 
     def advance(step: Array, carry: tuple[Chains, PyTree]) -> tuple[Chains, PyTree]:
         chains, buffers = carry
@@ -274,8 +253,8 @@ def _steps(kernel, key, chains, numbers, capacity):
         counts = jax.tree.map(
             lambda sum, new: sum + new.astype(sum.dtype), chains.num_invalid, steps.invalid
         )
-        # A draw is the last of the steps that are written to its row.
-        row = jnp.clip((step - burn_in) // thinning - before, 0, capacity - 1)
+        # In the burn-in, in the row of the first draw, which overwrites it.
+        row = jnp.maximum(step - jnp.maximum(first, burn_in), 0)
         buffers = jax.tree.map(lambda rows, leaf: rows.at[row].set(leaf), buffers, steps.report)
         return Chains(steps.state, walk, counts), buffers
 

@@ -12,7 +12,7 @@ from mpfjax.checks import Count, checked, warn
 from mpfjax.filter import Filter
 from mpfjax.tuning.bijections import Unconstrained
 from mpfjax.tuning.evidence import Score, pose_evidence, warn_of_bias
-from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms, scores
+from mpfjax.tuning.problem import Parameters, Transforms, scores
 
 _MOST_NUMBERS = 50
 # Seeds whose Ẑ are averaged, as in `fit`.
@@ -64,48 +64,29 @@ def standard_errors(
     problem = pose_evidence(filter, observations, parameters, transforms, score)
     warn_of_bias("standard_errors", problem)
     size = min(num_seeds, _BATCH)
-    batches = list(jax.random.split(key, (-(-num_seeds // size), size)))
-    return errors_at([problem], problem.start(), batches, "num_seeds")
-
-
-def errors_at(
-    problems: list[Problem], reals: Reals, batches: list[Key[Array, " seeds"]], of_seeds: str
-) -> dict[str, np.ndarray] | None:
-    """The standard errors at a point, from the score with each batch of seeds.
-
-    `problems` are of different series, whose scores are added up. `of_seeds` is the argument that
-    says how many seeds there are.
-    """
-    problem = problems[0]
+    batches = jax.random.split(key, (-(-num_seeds // size), size))
+    reals = problem.start()
     point, unravel = ravel_pytree(reals)
     if point.size > _MOST_NUMBERS:
         raise ValueError(f"parameters: {point.size} numbers; differences do for {_MOST_NUMBERS}")
 
-    def score_of(keys: Key[Array, " seeds"], at: Reals) -> Float[np.ndarray, " d"]:
-        total = np.zeros(point.size)
-        for number, part in enumerate(problems):
-            gradient = scores(fold(keys, number) if number else keys, part, at, pooled=True)[1]
-            total += np.asarray(ravel_pytree(gradient)[0], float)
-        return total
-
-    fold = jax.vmap(jax.random.fold_in, (0, None))
-
-    def score(flat: np.ndarray) -> Float[np.ndarray, "batches d"]:
+    def score_at(flat: np.ndarray) -> Float[np.ndarray, "batches d"]:
         at = unravel(jnp.asarray(flat))
-        return np.stack([score_of(keys, at) for keys in batches])
+        gradients = [scores(keys, problem, at, pooled=True)[1] for keys in batches]
+        return np.stack([np.asarray(ravel_pytree(each)[0], float) for each in gradients])
 
     # By number, how far a step may go.
     longest = np.concatenate([
         np.full(reals[name].size, np.inf if isinstance(transform, Unconstrained) else _LONGEST)
         for name, transform in sorted(problem.transforms.items())
     ])  # fmt: skip
-    informations = _informations(score, np.asarray(point), longest)
+    informations = _informations(score_at, np.asarray(point), longest)
     covariance = _inverse(informations.mean(axis=0))
     if covariance is None:
         what = "the log marginal likelihood has no maximum here, or too few seeds to see it"
         warn(f"standard_errors: {what}", UserWarning)
         return None
-    _warn_of_noise(informations, covariance, of_seeds)
+    _warn_of_noise(informations, covariance)
     # By the Jacobian of the parameters on their own scale, laid out in the same order.
     _, shaped = ravel_pytree(problem.constrain(reals))
 
@@ -174,9 +155,7 @@ def _inverse(information: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"] 
 
 
 def _warn_of_noise(
-    informations: Float[np.ndarray, "batches d d"],
-    covariance: Float[np.ndarray, "d d"],
-    of_seeds: str,
+    informations: Float[np.ndarray, "batches d d"], covariance: Float[np.ndarray, "d d"]
 ) -> None:
     """Warn where errors are uncertain: by the delta method, from what each batch adds to them."""
     num_batches, scale = len(informations), np.diagonal(covariance)
@@ -186,5 +165,5 @@ def _warn_of_noise(
         uncertain = of_each.std(axis=0, ddof=1).max() / 2 / num_batches**0.5
         by = f" by {uncertain:.0%}"
     if uncertain > _MOST_UNCERTAIN:
-        what = f"the seeds leave them uncertain{by}; raise {of_seeds}"
+        what = f"the seeds leave them uncertain{by}; raise num_seeds"
         warn(f"standard_errors: {what}", UserWarning)

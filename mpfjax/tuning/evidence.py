@@ -17,8 +17,7 @@ from mpfjax.moves.base import AbstractProposal, all_of, check_keep_parents
 from mpfjax.running.results import FilterRun
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions
-from mpfjax.smoothing.history import mixtures_of
-from mpfjax.smoothing.trajectories import draw_trajectories
+from mpfjax.smoothing.trajectories import draw_trajectories, mixtures_of
 from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, places_of, pose
 
 UnbiasedFilter = Annotated[
@@ -119,7 +118,7 @@ class FisherEvidence(LogEvidence):
 
         def log_joint(key: Key[Array, ""], run: FilterRun, series: Series) -> Float[Array, ""]:
             paths, _ = draw_trajectories(
-                key, fixed.model, mixtures_of(run), series.inputs, _NUM_PATHS, num_moves=1
+                key, fixed.model, mixtures_of(run), series.inputs, _NUM_PATHS, "mcmc"
             )
             return jnp.mean(jax.vmap(LogJoint(series), (0, None))(paths, filter))
 

@@ -10,10 +10,9 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, CountOrZero, Rule, checked, shown, warn
+from mpfjax.checks import Count, Rule, checked, shown, warn
 from mpfjax.filter import Filter
-from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
-from mpfjax.tuning.curvature import errors_at
+from mpfjax.running.long_runs import Broken, LongRun, State
 from mpfjax.tuning.evidence import Score, names_but_proposals, pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import (
     Objective,
@@ -56,10 +55,8 @@ class TuningRun:
     sequences. Of a batch, the first two are scaled to all sequences."""
     stopped: str | None
     """why it ended before `num_steps`, or None."""
-    effective_seeds: Float[np.ndarray, " series"] | None = None
+    effective_seeds: Float[np.ndarray, " series"] | None
     """of `fit`, for each sequence, (Σ Ẑ)² / Σ Ẑ² over seeds at the end: how many of them count."""
-    standard_errors: dict[str, np.ndarray] | None = None
-    """of every number in the parameters; None if not asked for, or if there is no maximum."""
 
 
 @checked
@@ -76,8 +73,6 @@ def fit(
     batch: Count | None = None,
     pooled: bool | None = None,
     score: Score = "filter",
-    curvature_seeds: CountOrZero = 0,
-    checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> TuningRun:
     """Maximise the log marginal likelihood over some of a filter's parameters.
@@ -117,11 +112,6 @@ def fit(
       needs no derivative of draws or moves. The model needs `log_transition` and `log_initial` and
       may not be conditionally linear, the parameters must be the model's, and every move must leave
       each particle one parent.
-    - `curvature_seeds`: the seeds for `standard_errors` at the end, in whole batches of
-      `num_seeds`; 0 for none.
-    - `checkpoint`: a `Checkpoint`, from whose file the same call continues, also to a larger
-      `num_steps`. Everything else must be the same: the filter and the observations to the bit, the
-      parameters, transforms, key, seeds and batches, and the steps of the optimiser.
 
     A warning is issued if fewer than two seeds count (`effective_seeds`), because log Ẑ varies
     strongly from seed to seed: the bias is then about that of one seed.
@@ -129,10 +119,9 @@ def fit(
     If the log marginal likelihood or the gradient is not finite, the optimisation ends with the
     last good parameters, a warning, and the step in `stopped`. Ctrl-C ends it with a warning as
     well. Raises `ValueError` for a parameter that is not a floating-point number, is static, starts
-    outside its domain or has no effect, and for "fisher" if one of its requirements is missing.
-    Raises it for a checkpoint of another fit, naming the difference, for one that is truncated or
-    lacks an array, and as `run_filter` does. Raises `RuntimeError` if the initial value is not
-    finite.
+    outside its domain or has no effect, for "fisher" if one of its requirements is missing, and as
+    `run_filter` does. Raises `RuntimeError` if the initial value is not finite. Use
+    `standard_errors` with the result.
     """
     problem = pose_evidence(filter, observations, parameters, transforms, score)
     warn_of_bias("fit", problem)
@@ -142,19 +131,14 @@ def fit(
         "fit", "log marginal likelihood", key, problem, optimizer, num_seeds, batch, pooled
     )
     data = {"observations": problem.objective, "score": score}
-    reals, values, run = ascent.climb(num_steps, checkpoint, progress, data)
+    values, run = ascent.climb(num_steps, progress, data)
     if pooled:
         _warn_of_few_seeds(run[3]["effective_seeds"], values)
-    effective, errors = None, None
+    effective = None
     if values is not None:
         effective = np.empty(values.shape[1])
         effective[list(problem.objective.places)] = _effective_seeds(values)
-    if curvature_seeds:
-        key_curvature = jax.random.fold_in(key, num_steps + 1)
-        shape = (-(-curvature_seeds // num_seeds), num_seeds)  # which is compiled already
-        batches = list(jax.random.split(key_curvature, shape))
-        errors = errors_at(ascent.parts(), reals, batches, "curvature_seeds")
-    return TuningRun(*run, effective_seeds=effective, standard_errors=errors)
+    return TuningRun(*run, effective_seeds=effective)
 
 
 def _effective_seeds(values: Float[np.ndarray, "seeds series"]) -> Float[np.ndarray, " series"]:
@@ -183,33 +167,30 @@ def maximise(
     *,
     parameters: Parameters = None,
     transforms: Transforms = None,
-    num_seeds: Count = 1,
-    checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> TuningRun:
     """Maximise any objective over some of a model's, or a filter's, parameters.
 
-    Maximises the mean over seeds of `objective(key, model)`, a scalar that JAX can differentiate,
-    as `fit` does for the log marginal likelihood, with the same arguments, checks and report. Use
-    it for another objective, such as that of an unnormalised likelihood on labelled frames
-    (`LabelLikelihood`).
+    Maximises `objective(key, model)`, a scalar that JAX can differentiate, with a new key in each
+    step, as `fit` does for the log marginal likelihood, with the same arguments, checks and report.
+    Use it for another objective, such as that of an unnormalised likelihood on labelled frames.
 
     - `model`: the pytree that is the argument of the objective.
     - `objective`: a function, or an `equinox.Module` with a `__call__`, whose arrays are the data.
-      A deterministic objective ignores its key, and needs one seed.
+      A deterministic objective ignores its key.
     - `parameters`: as for `fit`, selected from `model`; None is every floating-point array of it.
 
     Raises errors as `fit` does for the same arguments, and `ValueError` for an objective that is
     not a floating-point scalar.
     """
     problem = pose(model, objective, parameters, transforms)
-    ascent = _Ascent("maximise", "value", key, problem, optimizer, num_seeds)
+    ascent = _Ascent("maximise", "value", key, problem, optimizer)
     value = eqx.filter_eval_shape(objective, key, problem.at(problem.start()))
     if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(f"objective: it returns {shown(value)}, no floating point scalar")
-    _, _, run = ascent.climb(num_steps, checkpoint, progress, {"objective": objective})
+    _, run = ascent.climb(num_steps, progress, {"objective": objective})
     del run[3]["effective_seeds"]  # of values that are no logarithms of likelihoods
-    return TuningRun(*run)
+    return TuningRun(*run, effective_seeds=None)
 
 
 @dataclass(frozen=True)
@@ -221,33 +202,28 @@ class _Ascent:
     key: Key[Array, ""]
     problem: Problem
     optimizer: optax.GradientTransformation
-    num_seeds: int
+    num_seeds: int = 1
     batch: int | None = None  # of the series in a step, where the objective is a `LogEvidence`
     pooled: bool = False
 
     def climb(
-        self,
-        num_steps: int,
-        checkpoint: Checkpoint | None,
-        progress: bool,
-        data: dict[str, Any],
-    ) -> tuple[Reals, Float[np.ndarray, "seeds series"] | None, tuple]:
-        """The parameters at the end, the objective there, and the first fields of a `TuningRun`."""
+        self, num_steps: int, progress: bool, data: dict[str, Any]
+    ) -> tuple[Float[np.ndarray, "seeds series"] | None, tuple]:
+        """The objective at the end, and the first fields of a `TuningRun`."""
         reals = self.problem.start()
         optimizer = self.optimizer.init(reals)
         no_path = jax.tree.map(lambda u: np.empty((0, *u.shape), u.dtype), reals)
         start = State(0, (reals, optimizer), (np.empty(0), np.empty(0), np.empty(0), no_path))
         settings = {"key": self.key, "num_seeds": int(self.num_seeds)}
         settings |= {"batch": self.batch, "pooled": self.pooled} | self.problem.settings | data
-        identity = identity_of(self.caller, checkpoint, settings)
-        run = LongRun(self.caller, num_steps, checkpoint, progress, lambda step: identity)
+        run = LongRun(self.caller, num_steps, progress, lambda step: settings)
         state, stopped = run.go(start, self._advance)
         (reals, _), (averages, deviations, effective, path) = state.carry, state.rows
         key = jax.random.fold_in(self.key, state.step)
         try:
             values = np.concatenate([
                 self._evaluate(jax.random.fold_in(key, number), part, reals)[0]
-                for number, part in enumerate(self.parts())
+                for number, part in enumerate(self._parts())
             ], axis=1)  # fmt: skip
             value = self._average(values)
         except Broken as fault:
@@ -260,9 +236,9 @@ class _Ascent:
         history = {"value": averages, "deviation": deviations, "effective_seeds": effective}
         history |= self.problem.constrained_rows(path)
         parameters = jax.tree.map(np.asarray, self.problem.constrain(reals))
-        return reals, values, (self.problem.at(reals), parameters, value, history, stopped)
+        return values, (self.problem.at(reals), parameters, value, history, stopped)
 
-    def parts(self) -> list[Problem]:
+    def _parts(self) -> list[Problem]:
         """The problem, or one for each batch of series, in the order in which they stand."""
         if self.batch is None:
             return [self.problem]

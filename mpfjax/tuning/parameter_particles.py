@@ -17,9 +17,16 @@ from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.logarithms import log_sum_exp
 from mpfjax.running.scan import first_mixture, step_or_predict
-from mpfjax.tuning.densities import Point, Prior, evaluated, is_invalid, number_or_zero
+from mpfjax.tuning.densities import (
+    Point,
+    Prior,
+    evaluated,
+    factor_of,
+    is_invalid,
+    metropolis_step,
+    number_or_zero,
+)
 from mpfjax.tuning.problem import Problem, Reals
-from mpfjax.tuning.walks import factor_of, metropolis_step
 
 
 class Sampler(eqx.Module):
@@ -30,14 +37,6 @@ class Sampler(eqx.Module):
     series: Series
     prior: Prior
     num_moves: int = eqx.field(static=True)
-
-    def with_particles(self, num_particles: int) -> "Sampler":
-        """The sampler with filters of another number of particles."""
-        if num_particles == self.problem.tree.num_particles:
-            return self
-        resized = self.problem.tree.replace(num_particles=num_particles)
-        problem = dataclasses.replace(self.problem, structure=jax.tree.structure(resized))
-        return dataclasses.replace(self, problem=problem)
 
     def start(self, key: Key[Array, ""], reals: Reals) -> Point:
         """A θ with the mixture of x_0."""
@@ -83,26 +82,6 @@ class Sampler(eqx.Module):
         return mixture, info.log_likelihood_increment
 
 
-Weighed = tuple[ParticleMixture, Float[Array, ""], Float[Array, ""], Int[Array, ""]]
-"""Samples, the log of the mean of their factors (-inf where all are zero), their effective sample
-size, and how many θs were dropped, since their likelihood was NaN or +inf."""
-
-
-def _reweight(
-    samples: ParticleMixture,
-    points: Point,
-    log_factors: Float[Array, " n"],
-    invalid: Bool[Array, " n"],
-) -> Weighed:
-    """The points with the samples' weights times these factors; zero stays zero."""
-    alive = samples.log_weights > -jnp.inf
-    log_weights = jnp.where(alive, samples.log_weights + log_factors, -jnp.inf)
-    total = log_sum_exp(log_weights)
-    samples = samples.replace(particles=points, log_weights=log_weights - total)
-    num_invalid = jnp.sum(alive & invalid, dtype=jnp.int32)
-    return samples, total, samples.effective_sample_size, num_invalid
-
-
 @jit_on_wide_vectors
 def start(keys, sampler, reals):
     """The samples as particles of equal weight, in one component."""
@@ -113,12 +92,19 @@ def start(keys, sampler, reals):
 def extend(key, sampler, samples, t):
     """All samples after one more observation, weighted by it.
 
-    A θ whose likelihood is no number gets the weight zero, and keeps it.
+    A θ whose likelihood is no number gets the weight zero, and keeps it. Also the log of the mean
+    increment (-inf where all are zero), the effective sample size, and how many were dropped.
     """
     keys = jax.random.split(key, samples.num_particles)
     extend = jax.vmap(sampler.extend, in_axes=(0, 0, None))
     points, increments = extend(keys, samples.particles, t)
-    return _reweight(samples, points, number_or_zero(increments), is_invalid(increments))
+    alive = samples.log_weights > -jnp.inf
+    log_weights = samples.log_weights + number_or_zero(increments)
+    log_weights = jnp.where(alive, log_weights, -jnp.inf)
+    total = log_sum_exp(log_weights)
+    samples = samples.replace(particles=points, log_weights=log_weights - total)
+    num_invalid = jnp.sum(alive & is_invalid(increments), dtype=jnp.int32)
+    return samples, total, samples.effective_sample_size, num_invalid
 
 
 @jit_on_wide_vectors
@@ -159,18 +145,3 @@ def rejuvenate(key, sampler, samples, num_steps):
     ancestors = resampled.ancestor_indices[:num_chains]
     ancestors = jnp.concatenate([ancestors, jnp.repeat(ancestors, num_moves)])
     return single_component(everywhere), ancestors, rate, counts
-
-
-@jit_on_wide_vectors
-def exchange(key, sampler, samples, num_steps):
-    """The samples with filters of this sampler's number of particles, weighted by what they change.
-
-    The exchange step by importance sampling of Chopin, Jacob and Papaspiliopoulos (2013, section
-    3.6): each θ gets a new filter over all observations so far, and its weight is multiplied by the
-    new Ẑ over the old one. Also the log of the mean of these ratios.
-    """
-    keys = jax.random.split(key, samples.num_particles)
-    run_again = jax.vmap(sampler.run_again, in_axes=(0, 0, None))
-    points, invalid = run_again(keys, samples.particles.reals, num_steps)
-    ratios = points.log_likelihood - samples.particles.log_likelihood
-    return _reweight(samples, points, ratios, invalid["log_marginal_likelihood"])

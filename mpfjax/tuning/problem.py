@@ -130,7 +130,7 @@ def averages(values: Float[Array, "seeds series"], pooled: bool) -> Float[Array,
 
 @eqx.filter_jit
 def scores(
-    keys: Key[Array, " seeds"], problem: Problem, reals: Reals, pooled: bool = False
+    keys: Key[Array, " seeds"], problem: Problem, reals: Reals, pooled: bool
 ) -> tuple[Float[Array, "seeds series"], Reals]:
     """The objective of each seed and series, and the gradient of its `averages`' sum."""
 

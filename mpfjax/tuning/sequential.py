@@ -1,28 +1,27 @@
 """The posterior of parameters as observations come in, by SMC²."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, checked, kinds
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.series import Series
-from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
+from mpfjax.running.long_runs import Broken, LongRun, State
 from mpfjax.tuning.chains import warn_of_invalid
 from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn
 from mpfjax.tuning.evidence import UnbiasedFilter, one_sequence, pose_evidence, with_present
-from mpfjax.tuning.parameter_particles import Sampler, exchange, extend, rejuvenate, start
+from mpfjax.tuning.parameter_particles import Sampler, extend, rejuvenate, start
 from mpfjax.tuning.problem import Parameters, Problem, Transforms
 from mpfjax.tuning.summaries import numbers_of, row_of, table
 
 # The share of their number below which the effective sample size of the θs leads to moves.
 _ESS_THRESHOLD = 0.5
 _FEWEST_FAMILIES = 10
-# N is doubled after moves that accept less.
-_ACCEPTANCE_THRESHOLD = 0.2
 
 
 @dataclass(frozen=True, repr=False)
@@ -39,8 +38,6 @@ class SequentialPosterior:
     """of the samples after each observation, before any rejuvenation."""
     acceptance_rates: Float[np.ndarray, " t"]
     """of the moves after each observation, NaN where none were needed."""
-    num_particles: Int[np.ndarray, " t"]
-    """N of the filters after each observation."""
     num_invalid: dict[str, int]
     """how often `log_prior` or `log_marginal_likelihood` was NaN or +inf: of θs that were dropped,
     and of proposals that were rejected."""
@@ -51,9 +48,8 @@ class SequentialPosterior:
 
     @property
     def problem(self) -> Problem:
-        """What was sampled: the filter with its last N, and its parameters."""
-        run, state = self._end
-        return run.sampler.with_particles(state.carry[2]).problem
+        """What was sampled: the filter and its parameters."""
+        return self._end[0].sampler.problem
 
     @property
     def log_marginal_likelihood(self) -> float:
@@ -126,7 +122,7 @@ class SequentialPosterior:
         size = 1 / (self.weights.astype(float) ** 2).sum()
         heading = (
             f"{len(self.weights)} samples ({size:.0f} effective) after"
-            f" {len(self.num_particles)} observations, N = {self.num_particles[-1]}; log evidence"
+            f" {len(self.log_likelihood_increments)} observations; log evidence"
             f" {self.log_marginal_likelihood:.2f} ± {self.log_marginal_likelihood_error:.2f}"
         )
         return table(heading + (f"; {self.stopped}" if self.stopped else ""), self.summary())
@@ -154,10 +150,8 @@ def smc2(
     sample_prior: SamplePrior,
     log_prior: LogPrior,
     num_moves: Count = 5,
-    max_particles: Count | None = None,
     parameters: Parameters = None,
     transforms: Transforms = None,
-    checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> SequentialPosterior:
     """Sample p(θ | y_1..y_s) for s = 1, ..., t: particles of θ, each with its own filter.
@@ -178,12 +172,6 @@ def smc2(
       are resampled, and all states of their chains are retained (waste-free, Dau and Chopin 2022),
       which takes less time for the same number of samples than retaining only the ends of the
       chains.
-    - `max_particles`: if given, N is doubled after moves that accept less than a fifth, as long as
-      it stays below this: each θ receives a filter of 2N particles, and the weight Ẑ_2N / Ẑ_N
-      (section 3.6 there, the exchange step by importance sampling). Longer sequences need larger N.
-      Each N compiles its own programs.
-    - `checkpoint`: a `Checkpoint`, from whose file the samples continue, also to more observations
-      than so far. Everything else must be the same.
     - `observations`: one sequence, arrays or a `Series`; `SequentialPosterior.extend` processes
       later ones. `parameters`, `transforms`: as for `fit`.
 
@@ -194,10 +182,10 @@ def smc2(
 
     Raises `ValueError` for a filter that is `approximate`, numbers below one, `num_samples` that
     `num_moves` + 1 does not divide, draws of the prior of other names, shapes or domains than the
-    parameters or with a density that is not finite, a list of sequences, a checkpoint of other
-    samples, and as `fit` does; `RuntimeError` if every θ has zero likelihood at the first
-    observation. Use it to follow a posterior in time, for posteriors with several modes, and to
-    compare models; `metropolis_hastings` is simpler if only the last posterior is needed.
+    parameters or with a density that is not finite, a list of sequences, and as `fit` does;
+    `RuntimeError` if every θ has zero likelihood at the first observation. Use it to follow a
+    posterior in time, for posteriors with several modes, and to compare models;
+    `metropolis_hastings` is simpler if only the last posterior is needed.
     """
     size = num_moves + 1
     if num_samples % size:
@@ -213,34 +201,29 @@ def smc2(
     sampler = Sampler(problem, _pad(series, series.length), prior, int(num_moves))
     settings = problem.settings | {
         "key": key, "num_samples": int(num_samples), "num_moves": int(num_moves),
-        "max_particles": max_particles,
     }  # fmt: skip
-    identity = identity_of("smc2", checkpoint, settings)
-    run = _Run(sampler, series, key_steps, max_particles, checkpoint, progress, identity)
+    run = _Run(sampler, series, key_steps, progress, settings)
     samples = start(jax.random.split(key_filters, num_samples), sampler, reals)
     num_invalid = {"log_prior": 0, "log_marginal_likelihood": 0}
-    carry = samples, np.arange(num_samples), problem.tree.num_particles, num_invalid
-    rows = np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64)
-    return run.posterior(State(0, carry, rows))
+    rows = np.empty(0), np.empty(0), np.empty(0)
+    return run.posterior(State(0, (samples, np.arange(num_samples), num_invalid), rows))
 
 
 @dataclass(frozen=True)
 class _Run:
     """SMC² over some observations.
 
-    It carries the samples, their families, N and the counts of invalid densities. Its rows are the
-    increment, the effective sample size, the acceptance rate and N of each step.
+    It carries the samples, their families and the counts of invalid densities. Its rows are the
+    increment, the effective sample size and the acceptance rate of each step.
     """
 
     sampler: Sampler
-    """with the number of particles at the start."""
     series: Series
     """the data of the filters, in arrays of numpy."""
     key: Key[Array, ""]
-    max_particles: int | None
-    checkpoint: Checkpoint | None
     progress: bool
-    identity: dict[str, str]
+    settings: dict[str, Any]
+    """all that has to be the same for a file to fit, beside the observations."""
 
     def followed_by(self, step: int, observations: PyTree, progress: bool) -> "_Run":
         """The run with the observations that come after a step, and no others."""
@@ -265,12 +248,11 @@ class _Run:
     def posterior(self, start: State) -> SequentialPosterior:
         """The posterior after all observations, from a state on."""
 
-        def identity(step: int) -> dict[str, str]:
+        def settings(step: int) -> dict[str, Any]:
             before = jax.tree.map(lambda leaf: leaf[:step], self.series)
-            data = {"observations": with_present(before)}
-            return self.identity | identity_of("smc2", self.checkpoint, data)
+            return self.settings | {"observations": with_present(before)}
 
-        run = LongRun("smc2", self.series.length, self.checkpoint, self.progress, identity)
+        run = LongRun("smc2", self.series.length, self.progress, settings)
         state, stopped = run.go(start, self._advance)
         samples, *_, num_invalid = state.carry
         before = start.carry[-1]
@@ -286,33 +268,22 @@ class _Run:
 
     def _advance(self, step: int, last: int, carry: PyTree) -> tuple[int, PyTree, PyTree]:
         """The samples after one more observation."""
-        samples, families, num_particles, invalid = carry
-        counts, sampler = dict(invalid), self.sampler.with_particles(num_particles)
-        keys = jax.random.split(jax.random.fold_in(self.key, step), 3)
-        samples, *numbers = extend(keys[0], sampler, samples, jnp.asarray(step, jnp.int32))
+        samples, families, invalid = carry
+        counts, rate = dict(invalid), np.nan
+        keys = jax.random.split(jax.random.fold_in(self.key, step))
+        samples, *numbers = extend(keys[0], self.sampler, samples, jnp.asarray(step, jnp.int32))
         increment, size, num_invalid = map(float, numbers)
         counts["log_marginal_likelihood"] += int(num_invalid)
-        rate = np.nan
         if increment == -np.inf:
             broken = f", NaN or +inf in {num_invalid:g}," if num_invalid else ""
             raise Broken(f"no sample has any likelihood{broken}")
         if size < _ESS_THRESHOLD * samples.num_particles:
             so_far = jnp.asarray(step + 1, jnp.int32)
-            samples, ancestors, *report = rejuvenate(keys[1], sampler, samples, so_far)
-            families, (accepted, of_moves) = families[np.asarray(ancestors)], report
-            rate = float(accepted)
+            samples, ancestors, rate, of_moves = rejuvenate(keys[1], self.sampler, samples, so_far)
+            families, rate = families[np.asarray(ancestors)], float(rate)
             counts = {name: count + int(of_moves[name]) for name, count in counts.items()}
-            may_double = self.max_particles is not None and 2 * num_particles <= self.max_particles
-            if may_double and rate < _ACCEPTANCE_THRESHOLD:
-                larger = self.sampler.with_particles(2 * num_particles)
-                with_larger, gain, _, dropped = exchange(keys[2], larger, samples, so_far)
-                counts["log_marginal_likelihood"] += int(dropped)
-                # Where no filter of 2N particles has any likelihood, those of N are kept.
-                if float(gain) > -np.inf:
-                    samples, num_particles = with_larger, 2 * num_particles
-                    increment += float(gain)
-        row = (np.array([number]) for number in (increment, size, rate, num_particles))
-        return step + 1, (samples, families, num_particles, counts), tuple(row)
+        row = (np.array([number]) for number in (increment, size, rate))
+        return step + 1, (samples, families, counts), tuple(row)
 
 
 def _pad(series: Series, capacity: int) -> Series:

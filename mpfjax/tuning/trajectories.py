@@ -16,10 +16,10 @@ from mpfjax.models.series import Series, steps_ahead, steps_of_inputs
 from mpfjax.moves.base import check_keep_parents
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.smoothing.backward import draw
-from mpfjax.smoothing.conditional import draw_trajectory, shape_of_trajectory
+from mpfjax.smoothing.conditional import shape_of_trajectory
+from mpfjax.smoothing.trajectories import draw_trajectory
 from mpfjax.tuning.evidence import LogEvidence
-from mpfjax.tuning.gibbs import GibbsPosterior
-from mpfjax.tuning.metropolis import Posterior
+from mpfjax.tuning.mcmc import GibbsPosterior, Posterior
 from mpfjax.tuning.sequential import SequentialPosterior
 
 Chains = Posterior | GibbsPosterior | SequentialPosterior
@@ -65,7 +65,7 @@ def posterior_trajectories(
     - for `metropolis_hastings`, the run whose Ẑ was accepted is repeated with its key, once for all
       draws that share it, and yields one trajectory. The pair has the posterior distribution as
       exactly as θ alone, for any N (Andrieu, Doucet and Holenstein 2010, section 2.4.2);
-    - for `particle_gibbs`, the trajectories, which must be stored completely (`collect=None`);
+    - for `particle_gibbs`, its trajectories;
     - for `smc2`, a new filter over all observations is run for each sample, with the weight of its
       Ẑ over the Ẑ of the sample (Chopin, Jacob and Papaspiliopoulos 2013, section 3.6): correct as
       the number of samples grows. The draws are one chain, resampled by these weights.
@@ -76,9 +76,9 @@ def posterior_trajectories(
     - `num_trajectories`: how many of each chain, evenly spaced; None is one for each draw of θ. A
       few hundred are enough for bands, and each requires a run of the filter.
 
-    Raises `ValueError` for trajectories that were not stored, a posterior of several sequences, and
-    a conditionally linear model. Use it for the past with its uncertainty; `sample_trajectories` is
-    for known parameters, and `posterior_predictive` for the future.
+    Raises `ValueError` for a posterior of several sequences, and a conditionally linear model. Use
+    it for the past with its uncertainty; `sample_trajectories` is for known parameters, and
+    `posterior_predictive` for the future.
     """
     key_paths, key_observations = jax.random.split(key)
     states = states_of(key_paths, posterior, num_trajectories, whole=True)
@@ -110,8 +110,7 @@ def posterior_predictive(
     - for `metropolis_hastings`, x_t is a particle of the run whose Ẑ was accepted (Andrieu, Doucet
       and Holenstein 2010, section 2.4.2), which is repeated with its key, once for all draws that
       share it;
-    - for `particle_gibbs`, the end of the trajectory, which must be stored completely
-      (`collect=None`);
+    - for `particle_gibbs`, the end of the trajectory;
     - for `smc2`, a particle of the sample's own filter. There are as many draws as samples, as one
       chain, resampled by their weights.
 
@@ -119,8 +118,8 @@ def posterior_predictive(
       for bands, and for `metropolis_hastings` each requires a run of the filter.
     - `inputs`: u_{t+1}, ..., u_{t+k}, as for `run_filter`.
 
-    Raises `ValueError` for a model without `sample_observation(key, states)`, for trajectories that
-    were not stored, and for a posterior of several sequences. Use it for forecasts that include all
+    Raises `ValueError` for a model without `sample_observation(key, states)`, and for a posterior
+    of several sequences. Use it for forecasts that include all
     uncertainty; `forecast` is for known parameters, and `posterior_trajectories` for the past.
     """
     problem: Any = posterior.problem
@@ -140,8 +139,6 @@ def states_of(
     problem, values = posterior.problem, posterior.parameters
     if isinstance(posterior, GibbsPosterior):
         paths = posterior.trajectories
-        if {leaf.shape[2:3] for leaf in jax.tree.leaves(paths)} != {posterior.renewed.shape[2:]}:
-            raise ValueError("posterior: its trajectories are not whole, as by collect=None")
         paths = paths if whole else jax.tree.map(lambda leaf: leaf[:, :, -1], paths)
         return problem, problem.objective.series, *_thin((values, paths), number)
     if isinstance(posterior, SequentialPosterior):
@@ -205,11 +202,10 @@ def _run_again(
     """
     filter, length = problem.tree, evidence.groups[0].observations
     length = jax.tree.leaves(length)[0].shape[1] + 1
-    backward = callable(getattr(filter.model, "log_transition", None))
     size = _TOGETHER
     if whole:
         refuse_marginalised(filter.model, _METHOD, "sample_trajectories takes it")
-        if not backward:
+        if not callable(getattr(filter.model, "log_transition", None)):
             check_keep_parents("posterior", filter.moves, f"{_METHOD} without log_transition")
         path = jax.tree.leaves(shape_of_trajectory(filter.model, length))
         each = sum(leaf.size * leaf.dtype.itemsize for leaf in path) + 16 * length
@@ -218,12 +214,12 @@ def _run_again(
     number, parts = rows[0].shape[0], []
     for first in range(0, number, size):
         batch = _rows_of(rows, np.arange(first, first + size) % number)
-        parts.append(_in_numpy(_runs_again(problem, evidence, batch, whole, backward)))
+        parts.append(_in_numpy(_runs_again(problem, evidence, batch, whole)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *parts)
 
 
 @jit_on_wide_vectors
-def _runs_again(problem, evidence, rows, whole, backward):
+def _runs_again(problem, evidence, rows, whole):
     (group,) = evidence.groups
     inputs = jax.tree.map(lambda leaf: leaf[0], group.inputs)
 
@@ -233,7 +229,7 @@ def _runs_again(problem, evidence, rows, whole, backward):
         (runs,) = evidence.runs(key_run, filter, whole)
         run = jax.tree.map(lambda leaf: leaf[0], runs)
         if whole:
-            states = draw_trajectory(key, filter.model, run, inputs, backward)
+            states = draw_trajectory(key, filter.model, run, inputs)
         else:
             states = _one_of(key, run.final)
         return states, run.log_marginal_likelihood

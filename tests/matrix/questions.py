@@ -363,22 +363,6 @@ def gibbs(row, data, options):
 
 
 @sampler
-def gibbs_draw(row, data, options):
-    """The draw's own formula leaves out what is NaN, as it is told to."""
-    value, r = row.form.value, row.case(data).law.r
-
-    def draw(key, trajectory, observations, model):
-        y = observations.reshape(len(Y))
-        gaps = jnp.where(jnp.isnan(y), 0.0, y - value(trajectory)[1:])
-        precision = 1 + jnp.sum(~jnp.isnan(y)).astype(float) / r**2
-        mean = jnp.sum(gaps) / r**2 / precision
-        shape = jnp.shape(row.form.offset(model))
-        return {"c": mean + jax.random.normal(key, shape) / jnp.sqrt(precision)}
-
-    return of_chains(tuning.particle_gibbs, row, data, draw=draw, **options)
-
-
-@sampler
 def smc2(row, data, options):
     keys, data = jax.random.split(jax.random.key(1), 8), (row.filter(data), row.case(data).series)
     found = [tuning.smc2(key, *data, 120, log_prior=log_prior, **options).mean("c") for key in keys]
@@ -397,14 +381,13 @@ OTHERS: dict[str, Callable] = {
     "derivative": score_with(lambda filter: filter),
     "score": score_with(mpfjax.with_score_gradient),
     "trajectories": backward(),
-    "trajectories, mcmc": backward(method="mcmc", num_moves=8),
+    "trajectories, mcmc": backward(method="mcmc"),
     "sums": sums(),
     "sums, mcmc": sums(method="mcmc"),
     "genealogy": genealogy,
     "conditional filter": conditional,
     "Metropolis": metropolis,
     "Gibbs": gibbs,
-    "Gibbs, draw": gibbs_draw,
     "SMC²": smc2,
 }
 QUESTIONS = OF_RUNS | OTHERS

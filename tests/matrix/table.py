@@ -59,10 +59,9 @@ OF_NOISE = these("point sets", "look-ahead")
 # What asks for the density of a step.
 OF_DENSITY = these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "score", "Gibbs",
                    "conditional filter")  # fmt: skip
-OF_STATES = these("trajectories, mcmc", "sums", "sums, mcmc", "conditional filter", "Gibbs",
-                  "Gibbs, draw")  # fmt: skip
+OF_STATES = these("trajectories, mcmc", "sums", "sums, mcmc", "conditional filter", "Gibbs")
 OF_PARENTS = these("genealogy", "trajectories, mcmc", "sums, mcmc")
-OF_PATHS = these("conditional filter", "Gibbs", "Gibbs, draw")
+OF_PATHS = these("conditional filter", "Gibbs")
 UNBIASED = these("Metropolis", "SMC²")
 JOINT = these("independent", "clustered")
 APPROXIMATE = GAUSSIAN | these("distributed", "Bernoulli", "Prune", "Exclusion", "own function",
@@ -131,8 +130,8 @@ RULES = (
                  "PropagateRegimes", "own function", "initially own function", "Prune",
                  "Exclusion"),
          questions=OF_PATHS),
-    Rule("log_initial", "`particle_gibbs` with a `log_prior` needs a density of x_0, which a "
-         "`MultiObjectModel` has not", forms=these("one of several"), questions=these("Gibbs")),
+    Rule("log_initial", "`particle_gibbs` needs a density of x_0, which a `MultiObjectModel` "
+         "has not", forms=these("one of several"), questions=these("Gibbs")),
     Rule("unbiased likelihood",
          "`metropolis_hastings` and `smc2` refuse filters that are `approximate`",
          filters=APPROXIMATE, questions=UNBIASED),

@@ -14,7 +14,7 @@ import pytest
 
 import mpfjax
 from mpfjax.operations.random import fast_key
-from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
+from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State
 from mpfjax.running.storage import read_described, write_described
 from tests.examples import make_mixture
 
@@ -192,9 +192,7 @@ class TestLongRuns:
 
     def go(self, path, last, stop=None, error=None, every=3, **settings):
         """The rows and what stopped it; `error` comes where a step beyond `stop` is asked for."""
-        checkpoint = None if path is None else Checkpoint(path, every)
-        identity = identity_of("adding", checkpoint, {"start": 0} | settings)
-        run = LongRun("adding", last, checkpoint, False, lambda step: identity)
+        run = LongRun("adding", last, False, lambda step: {"start": 0} | settings)
 
         start = State(0, np.array(0), np.zeros(0, int))
 
@@ -203,7 +201,8 @@ class TestLongRuns:
                 raise error
             return step + 1, total + step + 1, total[None] + step + 1
 
-        state, stopped = run.go(start, advance)
+        with contextlib.nullcontext() if path is None else Checkpoint(path, every):
+            state, stopped = run.go(start, advance)
         assert state.step == len(state.rows)
         return state.rows.tolist(), stopped
 

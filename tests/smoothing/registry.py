@@ -65,8 +65,7 @@ def _online(**options):
     def smooth(key, filter, observations, inputs=None):
         series, function = Series.skipping(observations, inputs), statistics_for(filter.model)
         found = smoothed_sums(key, filter, series, function, **options)
-        rows = found.sums if found.terms is None else found.terms
-        return found.run.log_likelihood_increments, rows
+        return found.run.log_likelihood_increments, found.sums
 
     return smooth
 
@@ -112,12 +111,10 @@ class Smoother(NamedTuple):
 SMOOTHERS = {
     "genealogy": Smoother(of_run=_genealogy),
     "backward sampling": Smoother(of_run=_backward()),
-    "backward sampling, MCMC": Smoother(of_run=_backward(method="mcmc", num_moves=8)),
+    "backward sampling, MCMC": Smoother(of_run=_backward(method="mcmc")),
     "PaRIS": Smoother(online=_online(), summed=True),
     "PaRIS, MCMC": Smoother(online=_online(method="mcmc"), summed=True),
-    "fixed lag": Smoother(online=_online(lag=LAG), lag=LAG),
-    "fixed lag, MCMC": Smoother(online=_online(lag=LAG, method="mcmc"), lag=LAG),
-    "fixed lag, step by step": Smoother(online=_stepwise, lag=LAG),
+    "fixed lag": Smoother(online=_stepwise, lag=LAG),
     "conditional filter": Smoother(kernel=_conditional),
 }
 
@@ -172,6 +169,6 @@ CASES = [
 QUICK_CASES = [
     *((name, "pf", "four dimensions") for name in SMOOTHERS if SMOOTHERS[name].of_run),
     ("PaRIS", "mpf", "two modes"),
-    ("fixed lag, step by step", "mpf", "one dimension"),
+    ("fixed lag", "mpf", "one dimension"),
     ("conditional filter", "mpf", "one dimension"),
 ]  # fmt: skip

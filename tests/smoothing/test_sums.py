@@ -14,48 +14,40 @@ from tests.smoothing.test_trajectories import QUADRATIC, SQUARES
 
 def test_no_lag_is_filtering_and_counts_are_averaged():
     filter = mpfjax.particle_filter(QUADRATIC, 50, ess_threshold=0.5)
-    run = mpfjax.run_filter(
-        jax.random.key(4),
-        filter,
-        SQUARES,
-        lambda mixture: mixture.expectation(mixture.particles > 1),
-    )
-    found = smoothed_sums(
-        jax.random.key(4), filter, SQUARES, lambda before, after: after > 1, lag=0
-    )
-    np.testing.assert_allclose(found.terms, run.collected, rtol=1e-5)
-    np.testing.assert_allclose(found.sums, np.cumsum(run.collected), rtol=1e-5)
-    np.testing.assert_array_equal(found.run.final.particles, run.final.particles)
+    smoother = FixedLagSmoother(filter, lambda before, after: after > 1, 0)
+    window = smoother.init(filter.init(jax.random.key(4)))
+    for key, seen in zip(jax.random.split(jax.random.key(5), 4), SQUARES, strict=True):
+        window, (found,), _ = smoother.step(key, window, seen)
+        moved = window.mixture
+        np.testing.assert_allclose(found, moved.expectation(moved.particles > 1), rtol=1e-5)
 
 
 @pytest.mark.exactness
 @pytest.mark.parametrize("method", ["exact", *weekly(["mcmc"])])
-def test_one_step_at_a_time_is_the_whole_series(method):
-    """From the same start by the same keys: the term at t - L, and at the end those left."""
-    lag, key, terms, spreads = 2, jax.random.key(3), [], []
+def test_a_lag_as_long_as_the_series_has_the_terms_of_the_sum(method):
+    """From the same start by the same keys."""
+    key, lag = jax.random.key(3), len(SQUARES) - 1
     filter = mpfjax.mixture_particle_filter(QUADRATIC, 50, 2)
 
     def function(before, after):
         return {"x": after, "up": before < after}
 
-    whole = smoothed_sums(key, filter, SQUARES, function, lag=lag, method=method)
+    whole = smoothed_sums(key, filter, SQUARES, function, method=method)
+    run = mpfjax.run_filter(key, filter, SQUARES)
+    np.testing.assert_array_equal(whole.run.final.particles, run.final.particles)
     smoother = FixedLagSmoother(filter, function, lag, method)
     window = smoother.init(whole.run.initial)
     keys = [jax.random.split(own, len(SQUARES)) for own in split(key, 3)[1:]]
-    for step_key, draw_key, seen in zip(*keys, SQUARES, strict=True):
+    for t, (step_key, draw_key, seen) in enumerate(zip(*keys, SQUARES, strict=True)):
         moved, _ = filter.step(step_key, window.mixture, seen)
         window, estimates = _advance(smoother, draw_key, window, moved, None)
-        terms.append(estimates)
-        spreads.append(smoother.variances(window))
-    np.testing.assert_array_equal(np.isnan(terms[0]["x"]), [True, True, False])
-    np.testing.assert_array_equal(np.isnan(spreads[0]["x"]), [True, True, False])
-    for each_step, of_all in ((terms, whole.terms), (spreads, whole.variances)):
-        for name, expected in of_all.items():
-            found = [*(each[name][0] for each in each_step[lag:]), *each_step[-1][name][1:]]
-            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+        spreads = smoother.variances(window)
+        for name, sums in whole.sums.items():
+            assert np.isnan(estimates[name]).sum() == np.isnan(spreads[name]).sum() == lag - t
+            np.testing.assert_allclose(np.nansum(estimates[name]), sums[t], rtol=1e-5)
     # An event has the variance p (1 - p).
-    chances = whole.terms["up"]
-    np.testing.assert_allclose(whole.variances["up"], chances * (1 - chances), atol=1e-5)
+    chances = estimates["up"]
+    np.testing.assert_allclose(spreads["up"], chances * (1 - chances), atol=1e-5)
 
 
 @pytest.mark.exactness
@@ -69,16 +61,18 @@ def test_variances_are_about_the_mean_however_far_from_zero(method):
         for place in (0.0, 20.0)
     )
     seen = (walk + 0.03 * noise[1][:, None]).astype(np.float32)
-    found = [
-        smoothed_sums(
-            jax.random.key(0), mpfjax.particle_filter(model, 300), seen + place,
-            lambda before, after: {"x": after, "xx": after**2}, lag=12, method=method,
-        )
-        for model, place in ((near, 0.0), (far, 20.0))
-    ]  # fmt: skip
-    at_zero, away = (each.variances["x"] for each in found)
-    recipe = found[0].terms["xx"] - found[0].terms["x"] ** 2
-    np.testing.assert_allclose(at_zero, recipe, rtol=1e-3)
+
+    def moments(model, place):
+        """The terms at the end, and their variances."""
+        filter = mpfjax.particle_filter(model, 300)
+        smoother = FixedLagSmoother(filter, lambda x, y: {"x": y, "xx": y**2}, 11, method)
+        window = smoother.init(filter.init(jax.random.key(0)))
+        for key, y in zip(jax.random.split(jax.random.key(1), 12), seen + place, strict=True):
+            window, terms, _ = smoother.step(key, window, y)
+        return terms, smoother.variances(window)["x"]
+
+    (terms, at_zero), (_, away) = moments(near, 0.0), moments(far, 20.0)
+    np.testing.assert_allclose(at_zero, terms["xx"] - terms["x"] ** 2, rtol=1e-3)
     exact = mpfjax.exact.kalman_smoother(near, seen).covariances[-12:, 0]
     np.testing.assert_allclose(away, exact, rtol=0.35)
     np.testing.assert_allclose(np.mean(away / exact), 1, atol=0.1)

@@ -9,8 +9,8 @@ import pickle
 import pytest
 
 MODULES = ("mpfjax", "mpfjax.robots", "mpfjax.tuning", "mpfjax.smoothing", "mpfjax.exact",
-           "mpfjax.vision", "mpfjax.smoothing.variance", "mpfjax.tuning.metropolis",
-           "mpfjax.tuning.gibbs", "mpfjax.tuning.sequential")  # fmt: skip
+           "mpfjax.vision", "mpfjax.smoothing.variance", "mpfjax.tuning.mcmc",
+           "mpfjax.tuning.sequential")  # fmt: skip
 PUBLIC = {
     name: value
     for module in map(importlib.import_module, MODULES)

@@ -337,10 +337,6 @@ def chain(filter=OF_SCALAR, **options):
     return tuning.metropolis_hastings(KEY, filter, TWO, 4, **options)
 
 
-def gibbs(draw=lambda *given: {"a": 1.0}, **options):
-    return tuning.particle_gibbs(KEY, OF_SCALAR, TWO, 4, draw=draw, **OF_A | options)
-
-
 def climb(**options):
     return tuning.fit(KEY, OF_SCALAR, TWO, ASCENT, 2, **OF_A | options)
 
@@ -475,8 +471,6 @@ REFUSED = (
     # smoothing
     ("observations: .3. steps", lambda: paths(
         run_of(SWITCHING, TWO[:, None]), SWITCHING, observations=THREE[:, None])),
-    ("component: 1 is empty",
-     lambda: paths(run(Filter(MODEL, [Propagate()], 4, 2)), component=1)),
     ("mixtures: not those of a whole run", lambda: paths(HISTORY.final)),
     (r"mixtures: \[ParticleMixture\(particles=f32\[4\], .* is not", lambda: paths([MIXTURE])),
     (r"q: 90 is not in \[0, 1\]", lambda: MIXTURE.quantile(MIXTURE.particles, 90)),
@@ -504,9 +498,8 @@ REFUSED = (
     ("(?s)filter: .* none of its moves is approximate", lambda: chain(GAUSSIAN)),
     (r"proposal_deviations: those of \['b'\]", lambda: chain(proposal_deviations={"b": 1.0})),
     ("log_prior: -inf at the start", lambda: chain(log_prior=lambda p: 0 * p["a"] - jnp.inf)),
+    (r"sample_prior: a of shape \(2,\)", lambda: chain(sample_prior=lambda key: {"a": TWO})),
     ("log_prior: .* is no floating", lambda: chain(log_prior=lambda p: jnp.ones(2) * p["a"])),
-    ("draw, log_prior: .*exactly one", lambda: gibbs(log_prior=nothing)),
-    (r"draw: a of shape \(2,\)", lambda: gibbs(lambda *given: {"a": TWO})),
     ("parameters: the value does not depend on h",
      lambda: tuning.maximise(KEY, SCALAR, lambda key, model: model.a, ASCENT, 2)),
     ("transforms: b is not among", lambda: climb(transforms={"b": tuning.Positive()})),

@@ -47,14 +47,6 @@ def sample_a(key):
     return {"a": MEAN_OF_A + DEVIATION_OF_A * jax.random.normal(key)}
 
 
-def draw_a(key, trajectory, observations, model):
-    """a is normal given the trajectory: a regression of each state on the one before."""
-    before, after = trajectory[:-1], trajectory[1:] - INPUTS
-    precision = DEVIATION_OF_A**-2 + jnp.sum(before**2) / model.q**2
-    mean = (MEAN_OF_A / DEVIATION_OF_A**2 + jnp.sum(before * after) / model.q**2) / precision
-    return {"a": mean + jax.random.normal(key) / jnp.sqrt(precision)}
-
-
 def log_prior_of_a(parameters):
     return norm.logpdf(parameters["a"], MEAN_OF_A, DEVIATION_OF_A)
 

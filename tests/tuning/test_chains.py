@@ -1,4 +1,4 @@
-"""What the samplers share: starts, burn-in, learning, thinning, files and interruptions."""
+"""What the samplers share: starts, burn-in, learning, files and interruptions."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import mpfjax
 from mpfjax import Checkpoint
 from mpfjax.tuning import chains as chains_of
 from mpfjax.tuning import metropolis_hastings
-from mpfjax.tuning.walks import random_walk
+from mpfjax.tuning.densities import random_walk
 from tests.user_models import ScalarLinear
 
 COVARIANCE = np.array([[1.0, 0.9 * 0.05], [0.9 * 0.05, 0.05**2]])
@@ -56,8 +56,6 @@ class TestLearning:
         options = {"sample_prior": dispersed, "burn_in": 600}
         run = blind(600, **options)
         points = np.stack([run.parameters["a"], run.parameters["q"]], axis=-1).astype(float)
-        ideal = COVARIANCE * 2.38**2 / 2
-        np.testing.assert_allclose(run.proposal_covariance, ideal, rtol=0.25)
         assert 0.25 < run.acceptance_rate < 0.45
         assert blind(600, **options | {"burn_in": 0}).acceptance_rate < 0.2
         scale = np.sqrt(np.diag(COVARIANCE))
@@ -92,14 +90,7 @@ class TestLearning:
         )
 
 
-def test_thinning_keeps_every_so_many_th_step():
-    every, third = blind(31, burn_in=4), blind(31, burn_in=4, thinning=3)
-    assert third.parameters["a"].shape == (30, 10)
-    np.testing.assert_array_equal(third.parameters["a"], every.parameters["a"][:, 2:30:3])
-    np.testing.assert_array_equal(third.accepted, every.accepted[:, 2:30:3])
-
-
-WHOLE = {"burn_in": 9, "thinning": 2, "sample_prior": dispersed}
+WHOLE = {"burn_in": 9, "sample_prior": dispersed}
 
 
 def interrupt_after(monkeypatch, steps):
@@ -122,36 +113,25 @@ def assert_same_draws(one, other):
 @pytest.mark.exactness
 def test_interrupted_anywhere_the_draws_are_those_of_one_run(tmp_path, monkeypatch):
     """In the burn-in, where nothing is lost, and after it, where the draws so far come back."""
-    whole, kept = blind(30, **WHOLE), WHOLE | {"checkpoint": Checkpoint(tmp_path / "c.npz", 4)}
-    with monkeypatch.context() as patch:
+    whole, file = blind(15, **WHOLE), Checkpoint(tmp_path / "chains.npz", 4)
+    with monkeypatch.context() as patch, file:
         interrupt_after(patch, 5)
         with pytest.raises(KeyboardInterrupt):
-            blind(30, **kept)
-    with monkeypatch.context() as patch:
-        interrupt_after(patch, 18)
-        with pytest.warns(UserWarning, match=r"interrupted at step \d+ of 39"):
-            part = blind(30, **kept)
+            blind(15, **WHOLE)
+        interrupt_after(patch, 14)
+        with pytest.warns(UserWarning, match=r"interrupted at step \d+ of 24"):
+            part = blind(15, **WHOLE)
     draws = part.parameters["a"].shape[1]
     assert 0 < draws < 15
     assert "interrupted" in part.stopped
     np.testing.assert_array_equal(part.parameters["a"], whole.parameters["a"][:, :draws])
-    assert_same_draws(blind(30, **kept), whole)
-    assert_same_draws(blind(44, **kept), blind(44, **WHOLE))
-    np.testing.assert_array_equal(blind(30, **kept).parameters["a"], whole.parameters["a"])
-
-
-@pytest.mark.parametrize(
-    ("other", "named"),
-    [
-        ({"thinning": 1}, "thinning is 2 there and 1 here"),
-        ({"num_chains": 3}, "num_chains is .* there and 3 here"),
-    ],
-)
-def test_a_file_of_other_chains_is_refused(other, named, tmp_path):
-    options = WHOLE | {"checkpoint": Checkpoint(tmp_path / "chains.npz")}
-    blind(4, **options)
-    with pytest.raises(ValueError, match=rf"is of another metropolis_hastings: .*{named}"):
-        blind(4, **options | other)
+    longer = blind(22, **WHOLE)
+    with file:
+        assert_same_draws(blind(15, **WHOLE), whole)
+        assert_same_draws(blind(22, **WHOLE), longer)
+        with pytest.raises(ValueError, match=r"of another metro.*num_chains is .* and 3 here"):
+            blind(15, num_chains=3, **WHOLE)
+        np.testing.assert_array_equal(blind(15, **WHOLE).parameters["a"], whole.parameters["a"])
 
 
 @pytest.mark.exactness

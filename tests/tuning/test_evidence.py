@@ -26,7 +26,7 @@ def test_a_missing_number_is_the_models_to_deal_with(missing):
     problem = pose_evidence(filter, series, GAIN, None)
     (key,) = jax.random.split(jax.random.fold_in(KEY, 0), 1)
     run = mpfjax.run_filter(key, filter, SEEN, lambda mixture: None, missing=missing)
-    (found,), _ = scores(KEY[None], problem, problem.start())
+    (found,), _ = scores(KEY[None], problem, problem.start(), pooled=False)
     np.testing.assert_allclose(found, run.log_marginal_likelihood, rtol=1e-4)
 
 

@@ -40,14 +40,14 @@ class Counted(ScalarLinear):
 
 @pytest.mark.weekly
 def test_likelihoods_are_those_of_the_states_and_calls_share_a_program():
-    """They change when, and only when, a step moves; of any length, burn-in and thinning."""
+    """They change when, and only when, a step moves; of any length and burn-in."""
     filter = mpfjax.particle_filter(Counted(), 12)
     run = sample(30, num_chains=3, filter=filter)
     moved = np.diff(run.log_marginal_likelihoods, axis=1) != 0
     np.testing.assert_array_equal(np.diff(run.parameters["a"], axis=1) != 0, moved)
     np.testing.assert_array_equal(run.accepted[:, 1:], moved)
     before = len(TRACED)
-    sample(40, num_chains=3, filter=filter, burn_in=7, thinning=3, key=jax.random.key(5))
+    sample(40, num_chains=3, filter=filter, burn_in=7, key=jax.random.key(5))
     assert len(TRACED) == before > 0
 
 

@@ -1,5 +1,6 @@
 """`fit` finds the maximum, says what is wrong, and goes on where it was interrupted."""
 
+import contextlib
 import warnings
 from functools import cache
 from typing import ClassVar
@@ -15,7 +16,7 @@ from jax.scipy.stats import norm
 import mpfjax
 from mpfjax import Checkpoint
 from mpfjax.exact import kalman_filter
-from mpfjax.tuning import Interval, Positive, fit, standard_errors
+from mpfjax.tuning import Interval, Positive, fit, maximise, standard_errors
 from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import averages, pose, scores
 from tests.user_models import ScalarLinear
@@ -46,11 +47,12 @@ def small(num_particles=16, gradient="stop", **parameters):
     return mpfjax.particle_filter(Fragile(**parameters), num_particles, gradient=gradient)
 
 
-def short_fit(num_steps=6, *, parameters=NOISE, optimizer=ADAM, start=None, **options):
+def short_fit(num_steps=6, *, parameters=NOISE, optimizer=ADAM, start=None, path=None, **options):
     options = {"num_seeds": 4, "progress": False, "transforms": {"r": Positive()}} | options
     arguments = {"key": jax.random.key(0), "observations": OBSERVATIONS}
     arguments |= {"filter": small(**(start or {})), "optimizer": optimizer, "num_steps": num_steps}
-    return fit(**arguments | {"parameters": parameters} | options)
+    with contextlib.nullcontext() if path is None else Checkpoint(path):
+        return fit(**arguments | {"parameters": parameters} | options)
 
 
 def series_of(length, rng):
@@ -79,20 +81,22 @@ def test_the_maximum_is_found_with_its_standard_errors(gradient, score):
         best = step(best)
     hessian = np.asarray(jax.hessian(log_evidence)(best), float)
     exact_error = np.sqrt(np.diag(np.linalg.inv(-hessian)))
+    tuned = {
+        "parameters": {n: lambda filter, n=n: getattr(filter.model, n) for n in ("a", "r")},
+        "transforms": {"a": Interval(-1.0, 1.0), "r": Positive()}, "score": score,
+    }  # fmt: skip
     run = fit(
         jax.random.key(1),
         mpfjax.particle_filter(Normal(a=0.3, r=1.5), 100, gradient=gradient),
         sequences, optax.sgd(optax.cosine_decay_schedule(0.06, 50)), 50,
-        parameters={n: lambda filter, n=n: getattr(filter.model, n) for n in ("a", "r")},
-        transforms={"a": Interval(-1.0, 1.0), "r": Positive()},
-        num_seeds=8, curvature_seeds=64, score=score, progress=False,
+        num_seeds=8, progress=False, **tuned,
     )  # fmt: skip
+    errors = standard_errors(jax.random.key(2), run.tuned, sequences, num_seeds=64, **tuned)
     a, r = 2 / (1 + np.exp(-float(best[0]))) - 1, np.exp(float(best[1]))
     slope = np.array([(1 - a**2) / 2, r])
     found = np.array([run.parameters["a"], run.parameters["r"]])
     assert (np.abs(found - [a, r]) < 0.3 * slope * exact_error).all()
-    errors = np.array([run.standard_errors["a"], run.standard_errors["r"]])
-    np.testing.assert_allclose(errors, slope * exact_error, rtol=0.2)
+    np.testing.assert_allclose([errors["a"], errors["r"]], slope * exact_error, rtol=0.2)
     assert run.value == pytest.approx(float(log_evidence(best)), abs=2.0)
     assert run.stopped is None
     assert float(run.tuned.model.r) == pytest.approx(float(run.parameters["r"]))
@@ -216,22 +220,21 @@ class TestBatches:
         assert moved[0] == pytest.approx(num_parts * moved[1], rel=0.05)
 
     def test_in_the_middle_of_an_epoch_it_goes_on_where_it_was(self, tmp_path):
-        kept = self.OPTIONS | {"checkpoint": Checkpoint(tmp_path / "fit.npz")}
+        kept = self.OPTIONS | {"path": tmp_path / "fit.npz"}
         short_fit(4, **kept)
         assert_same(short_fit(7, **kept), short_fit(7, **self.OPTIONS))
         with pytest.raises(ValueError, match="batch is 2 there and 3 here"):
             short_fit(7, **kept | {"batch": 3})
 
-    @pytest.mark.exactness
-    def test_standard_errors_are_of_all_series(self):
-        """Where Ẑ is exact, they are r / sqrt(2 n) at the maximum, of n observations."""
-        rows = [y.astype(float) for y in np.random.default_rng(0).normal(size=(5, 40))]
-        r = float(np.sqrt(np.mean(np.square(rows))))
-        filter = mpfjax.particle_filter(Constant(r=r), 2, gradient="stop")
-        run = short_fit(
-            1, filter=filter, observations=rows, batch=2, optimizer=STILL, curvature_seeds=4
-        )
-        assert run.standard_errors["r"] == pytest.approx(r / np.sqrt(2 * 200), rel=0.02)
+
+@pytest.mark.exactness
+def test_standard_errors_are_of_all_series():
+    """Where Ẑ is exact, they are r / sqrt(2 n) at the maximum, of n observations."""
+    rows = [y.astype(float) for y in np.random.default_rng(0).normal(size=(5, 40))]
+    r = float(np.sqrt(np.mean(np.square(rows))))
+    filter = mpfjax.particle_filter(Constant(r=r), 2, gradient="stop")
+    found = standard_errors(jax.random.key(0), filter, rows, parameters=NOISE, num_seeds=4)
+    assert found["r"] == pytest.approx(r / np.sqrt(2 * 200), rel=0.02)
 
 
 @pytest.mark.exactness
@@ -261,11 +264,11 @@ class TestResuming:
         ],
     )
     def test_a_checkpoint_of_another_fit_is_refused_with_what_differs(self, tmp_path, other, named):
-        short_fit(1, checkpoint=Checkpoint(tmp_path / "fit.npz"))
+        short_fit(1, path=tmp_path / "fit.npz")
         with pytest.raises(
             ValueError, match=r"checkpoint: .*fit\.npz is of another fit: .*" + named
         ):
-            short_fit(checkpoint=Checkpoint(tmp_path / "fit.npz"), **other)
+            short_fit(path=tmp_path / "fit.npz", **other)
 
     @pytest.mark.parametrize(
         ("num_steps", "step", "last", "score"),
@@ -275,7 +278,7 @@ class TestResuming:
         self, tmp_path, num_steps, step, last, score
     ):
         """In the middle, or where its end was evaluated."""
-        options = {"optimizer": falling(step), "checkpoint": Checkpoint(tmp_path / "fit.npz")}
+        options = {"optimizer": falling(step), "path": tmp_path / "fit.npz"}
         options["score"] = score
         with pytest.warns(UserWarning, match=f"was nan at step {last}"):
             first = short_fit(num_steps, **options)
@@ -292,7 +295,7 @@ class TestResuming:
     def test_a_schedule_that_writes_into_its_closure_goes_on(self, tmp_path):
         """As optax's cosine does when it is first called, in this process and in a new one."""
         make = lambda: optax.adam(optax.cosine_decay_schedule(0.05, 10))  # noqa: E731
-        options = {"checkpoint": Checkpoint(tmp_path / "fit.npz")}
+        options = {"path": tmp_path / "fit.npz"}
         optimizer = make()
         short_fit(2, optimizer=optimizer, **options)
         short_fit(3, optimizer=optimizer, **options)
@@ -316,6 +319,27 @@ def test_a_start_without_a_likelihood_is_an_error():
 def falling(step):
     """An optimiser that takes the same step down whatever the gradient is."""
     return optax.stateless(lambda updates, _: jax.tree.map(lambda u: 0 * u - step, updates))
+
+
+class TestAnyObjective:
+    def ascent(self, num_steps):
+        def parabola(key, model):
+            return -((model.r - 3.0) ** 2)
+
+        arguments = jax.random.key(0), ScalarLinear(r=1.0), parabola, optax.sgd(0.1), num_steps
+        return maximise(*arguments, parameters={"r": lambda model: model.r}, progress=False)
+
+    def test_a_function_is_an_objective(self):
+        run = self.ascent(60)
+        assert run.parameters["r"] == run.tuned.r == pytest.approx(3.0, abs=1e-3)
+        np.testing.assert_allclose(run.history["r"][:2], [1.0, 1.4], rtol=1e-5)
+        assert run.value == pytest.approx(0.0, abs=1e-4)
+
+    def test_it_goes_on_from_a_checkpoint(self, tmp_path):
+        whole = self.ascent(6)
+        with Checkpoint(tmp_path / "ascent.npz"):
+            self.ascent(3)
+            assert_same(self.ascent(6), whole)
 
 
 class Plain(ScalarLinear):

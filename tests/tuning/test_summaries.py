@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from mpfjax.tuning.metropolis import Posterior
+from mpfjax.tuning.mcmc import Posterior
 from mpfjax.tuning.summaries import effective_sample_size, row_of, split_r_hat
 
 RNG = np.random.default_rng(0)
@@ -38,13 +38,14 @@ def test_weighted_draws_count_as_often_as_they_weigh():
     assert abs(weighted["50%"] - repeated["50%"]) < 0.2
 
 
-def posterior(**fields):
+def posterior(one_start=False):
     draws = {"a": RNG.normal(size=(2, 100)), "b": RNG.normal(size=(2, 100, 2))}
     accepted = np.zeros((2, 100), bool)
     accepted[:, ::4] = True
     return Posterior(
-        parameters=draws, accepted=accepted, log_marginal_likelihoods=draws["a"], **fields
-    )
+        parameters=draws, accepted=accepted, log_marginal_likelihoods=draws["a"],
+        stopped=None, num_invalid={}, problem=None, one_start=one_start, key_data=None,
+    )  # fmt: skip
 
 
 def test_a_posterior_prints_a_table_of_its_numbers_and_not_its_arrays():
