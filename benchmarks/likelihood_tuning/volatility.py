@@ -22,7 +22,7 @@ import mpfjax
 from benchmarks import harness
 from mpfjax.exact import grid_filter
 from mpfjax.models.series import Series
-from mpfjax.tuning import Interval, Positive, fit
+from mpfjax.tuning import Interval, Positive, fit, standard_errors
 from mpfjax.tuning.evidence import FisherEvidence, LogEvidence
 from mpfjax.tuning.problem import Reals, averages
 
@@ -244,7 +244,7 @@ def learned(
 def coverage(
     methods: Sequence[str], num_series: int, data_sets: int, steps: int, seed: int
 ) -> Table:
-    """The share of 90% intervals, by the standard errors of `fit`, that hold the true parameter."""
+    """The share of 90% intervals, by `standard_errors`, that hold the true parameter."""
     entries = [
         learned_from(num_series, method, steps, seed + number, CURVATURE_SEEDS)
         for method, number in harness.grid("fit", methods, range(data_sets))
@@ -276,18 +276,22 @@ def learned_from(
     # By default Adam's steps would remain small for a thousand steps after the first gradients,
     # which are large: b2 = .9 forgets them.
     optimizer = optax.adam(optax.cosine_decay_schedule(0.15, steps), b2=0.9)
-    began = process_time()
+    began, series, of_parameters = process_time(), list(simulate(num_series, seed)), None
+    tuned: Any = {"parameters": PARAMETERS, "transforms": TRANSFORMS, "score": score}
     with warnings.catch_warnings(action="ignore"):  # of the biases that are measured here
         run = fit(
-            jax.random.key(seed), volatility_filter(gradient, start),
-            list(simulate(num_series, seed)), optimizer, steps, parameters=PARAMETERS,
-            transforms=TRANSFORMS, num_seeds=num_seeds, batch=min(BATCH, num_series),
-            pooled=pooled, score=score, curvature_seeds=curvature_seeds, progress=False,
+            jax.random.key(seed), volatility_filter(gradient, start), series, optimizer, steps,
+            num_seeds=num_seeds, batch=min(BATCH, num_series), pooled=pooled, progress=False,
+            **tuned,
         )  # fmt: skip
+        if curvature_seeds:
+            of_parameters = standard_errors(
+                jax.random.key(seed + 1), run.tuned, series, num_seeds=curvature_seeds, **tuned
+            )
     errors = {name: abs(float(run.parameters[name]) - true) for name, true in TRUTH.items()}
     return {"method": method, "seed": seed, "seconds": process_time() - began} | errors | {
         "effective_seeds": np.asarray(run.effective_seeds).mean(), "start": start,
-        "standard_errors": run.standard_errors,
+        "standard_errors": of_parameters,
     }  # fmt: skip
 
 

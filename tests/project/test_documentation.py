@@ -36,7 +36,7 @@ SMALLER = {
     "04": [("20, 300, 25", "2, 30, 10")],
     "05": [
         ("200, 100, 24", "4, 3, 6"),
-        ("curvature_seeds=64", "curvature_seeds=8"),
+        ("num_seeds=64", "num_seeds=8"),
         ("for start in starts]", "for start in starts[:1]]"),
         ("guided, observations, 600,", "guided, observations, 10,"),
         ("num_frames = 40", "num_frames = 6"),

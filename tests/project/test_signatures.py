@@ -36,7 +36,7 @@ DIFFERENT = {
     "min_distance",  # of poses None leaves none out; of components that are split, zero
     "num_iterations",  # of Newton, of K-means from seeds, and within one component
     "num_moves",  # of states at each step; of parameters, which must cross their posterior
-    "num_seeds",  # an estimate's gradient, a function that need not be random, a matrix
+    "num_seeds",  # of a gradient, of a matrix of derivatives
     "reassembly",  # the paper's of its filter; the unbiased one of a move
     "regroup_every",  # a Gaussian of two modes loses both, a component of particles does not
     "resample",  # where None is the one that fits the number of targets
