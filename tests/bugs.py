@@ -148,7 +148,7 @@ BUGS = {
         "smoothing/backward.py",
         "log_weights = mixture.log_weights + log_density(future)",
         "log_weights = mixture.log_weights + 0 * log_density(future)",
-        "tests/smoothing/test_contracts.py -m 'not exactness' -k backward",
+        "tests/smoothing/test_contracts.py -k 'exact_ones and backward'",
     ),
     "the variance of log Ẑ counts pairs for less": Bug(
         "smoothing/variance.py",

@@ -129,14 +129,12 @@ class Terms(NamedTuple):
         """One of the terms."""
         return jax.tree.map(lambda leaf: leaf[r], self)
 
-    def variances_in(self, mixture: ParticleMixture) -> PyTree:
-        """Over all particles: the variance of the means, and the mean of the variances."""
-        between = jax.tree.map(mixture.variance, self.means)
-        return jax.tree.map(jnp.add, between, jax.tree.map(mixture.expectation, self.variances))
-
     def estimates_in(self, mixture: ParticleMixture) -> "Terms":
-        """The moments over all particles of a mixture."""
-        return Terms(jax.tree.map(mixture.expectation, self.means), self.variances_in(mixture))
+        """Over all particles; the variance is of the means, plus the mean of the variances."""
+        between = jax.tree.map(mixture.variance, self.means)
+        within = jax.tree.map(mixture.expectation, self.variances)
+        means = jax.tree.map(mixture.expectation, self.means)
+        return Terms(means, jax.tree.map(jnp.add, between, within))
 
 
 class Window(NamedTuple):

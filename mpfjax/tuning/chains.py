@@ -1,9 +1,7 @@
 """Markov chains of parameters: what their kernels are, and the loop over their steps."""
 
 import abc
-import math
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -28,11 +26,8 @@ from mpfjax.tuning.summaries import (
 )
 
 _MOST_DRAWS_OF_A_START = 100
-# A program holds at most this many draws, or bytes of them, before they leave the device.
-_MOST_DRAWS_AT_ONCE = 256
-_MOST_BYTES_AT_ONCE = 2**24
-# Between two calls of a program bars advance, files are written and Ctrl-C is handled.
-_SECONDS_BETWEEN = 0.5
+# By one call of a program; between two of them bars advance and Ctrl-C is handled.
+_STEPS_AT_ONCE = 10
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -45,8 +40,8 @@ class PosteriorOfChains:
     """which of these steps moved, or the share of their Metropolis steps that did."""
     stopped: str | None
     """why they ended before `num_steps`, or None."""
-    num_invalid: dict[str, np.ndarray]
-    """by density: how often in each chain it was NaN or +inf, in all its steps."""
+    num_invalid: Int[np.ndarray, " chains"]
+    """how often in each chain a density was NaN or +inf, in all its steps."""
     problem: Problem = field(compare=False)
     """what was sampled: the filter, its parameters and the observations."""
     one_start: bool
@@ -85,7 +80,7 @@ class Step(NamedTuple):
     state: Any  # its `reals` are the parameters
     report: tuple[Any, ...]  # what is kept of the step, the parameters first
     acceptance: Float[Array, ""]
-    invalid: dict[str, Array]  # how often a density was NaN or +inf, by its name
+    num_invalid: Int[Array, ""]  # how often a density was NaN or +inf
 
 
 class AbstractKernel(eqx.Module):
@@ -108,7 +103,7 @@ class Chains(eqx.Module):
 
     states: Any
     walk: RandomWalk
-    num_invalid: dict[str, Int[Array, " chains"]]
+    num_invalid: Int[Array, " chains"]
 
 
 @dataclass(frozen=True)
@@ -135,95 +130,68 @@ class Sampling:
         run = LongRun(self.caller, last, self.progress, lambda step: settings)
         key_starts, key_steps = jax.random.split(self.key)
         chains, none = self._start_chains(kernel, key_starts)
-        advance = self._advance(kernel, key_steps, none)
-        state, stopped = run.go(State(0, chains, none), advance)
+        state, stopped = run.go(State(0, chains, none), self._advance(kernel, key_steps))
         draws = jax.tree.map(lambda rows: rows[: self.num_steps], state.rows)
         reals, *rest = jax.tree.map(lambda rows: np.moveaxis(rows, 0, 1), draws)
-        num_invalid = jax.tree.map(np.asarray, state.carry.num_invalid)
-        warn_of_invalid(self.caller, num_invalid)
+        num_invalid = np.asarray(state.carry.num_invalid)
+        warn_of_invalid(self.caller, num_invalid.sum())
         return rest, {
             "parameters": self.problem.constrained_rows(reals), "problem": self.problem,
             "num_invalid": num_invalid, "stopped": stopped,
             "one_start": self.num_chains > 1 and self.sample_prior is None,
         }  # fmt: skip
 
-    def _starts(
-        self, kernel: AbstractKernel, key: Key[Array, ""]
-    ) -> tuple[Chains, Bool[Array, " chains"], PyTree]:
-        """All chains at the filter's own parameters, or at draws of the prior.
-
-        Also which can start there, and reports of no steps.
-        """
-        num = self.num_chains
-        if self.sample_prior is not None:
-            reals = drawn(key, self.problem, self.sample_prior, num)
-        else:
-            start = self.problem.start()
-            reals = jax.tree.map(lambda u: jnp.broadcast_to(u, (num, *u.shape)), start)
-        keys = jax.random.split(key, num)
-        return _start_all(kernel, keys, reals, random_walk(self.deviations, reals))
-
     def _start_chains(self, kernel: AbstractKernel, key: Key[Array, ""]) -> tuple[Chains, PyTree]:
         """All chains at their starts, and reports of no steps.
 
-        A draw of the prior at which a chain cannot start is drawn again.
+        They start at the filter's own parameters, or at draws of the prior. A draw at which a chain
+        cannot start is drawn again.
         """
-        chains, fine, none = self._starts(kernel, key)
+        start, fine, states = self.problem.start(), np.zeros(self.num_chains, bool), None
+        reals = jax.tree.map(lambda u: jnp.broadcast_to(u, (self.num_chains, *u.shape)), start)
+        for attempt in range(_MOST_DRAWS_OF_A_START if self.sample_prior else 1):
+            again = jax.random.fold_in(key, attempt) if attempt else key
+            if self.sample_prior is not None:
+                reals = drawn(again, self.problem, self.sample_prior, self.num_chains)
+            keys = jax.random.split(again, self.num_chains)
+            walk = random_walk(self.deviations, reals)
+            new, now_fine, none = _start_all(kernel, keys, reals, walk)
+            states = jax.vmap(chosen)(fine, states, new.states) if attempt else new.states
+            fine |= np.asarray(now_fine)
+            if fine.all():
+                walk = random_walk(self.deviations, states.reals)
+                return Chains(states, walk, new.num_invalid), jax.tree.map(np.asarray, none)
         where = "the start" if self.sample_prior is None else "any draw of sample_prior"
-        for attempt in range(1, _MOST_DRAWS_OF_A_START if self.sample_prior else 1):
-            if np.all(fine):
-                break
-            again = jax.random.fold_in(key, attempt)
-            new, now_fine, _ = self._starts(kernel, again)
-            states = jax.vmap(chosen)(fine, chains.states, new.states)
-            walk = random_walk(self.deviations, states.reals)
-            chains, fine = Chains(states, walk, chains.num_invalid), fine | now_fine
-        if not np.all(fine):
-            raise RuntimeError(f"{self.caller}: the prior or likelihood was NaN or inf at {where}")
-        return chains, jax.tree.map(np.asarray, none)
+        raise RuntimeError(f"{self.caller}: the prior or likelihood was NaN or inf at {where}")
 
-    def _advance(
-        self, kernel: AbstractKernel, key: Key[Array, ""], none: PyTree
-    ) -> Callable[..., Any]:
-        """Some steps of all chains, about as many as take half a second; `none` are no reports."""
-        length = 1
-        size = 8 * sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves(none))
-        capacity = max(1, min(_MOST_DRAWS_AT_ONCE, _MOST_BYTES_AT_ONCE // max(size, 1)))
+    def _advance(self, kernel: AbstractKernel, key: Key[Array, ""]) -> Callable[..., Any]:
+        """A few steps of all chains."""
 
         def advance(step: int, last: int, chains: Chains) -> tuple[int, Chains, PyTree]:
-            nonlocal length
-            last = min(step + length, last)
-            began = time.monotonic()
+            last = min(step + _STEPS_AT_ONCE, last)
             numbers = jnp.array([step, last, self.burn_in], jnp.int32)
-            chains, buffers = _steps(kernel, key, chains, numbers, capacity)
+            chains, buffers = _steps(kernel, key, chains, numbers)
             new = max(last - max(step, self.burn_in), 0)
             # Waits for the program, so that an interruption comes before anything is taken over.
-            rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:new], buffers)
-            seconds = time.monotonic() - began
-            if seconds < _SECONDS_BETWEEN / 2:
-                length = min(2 * length, capacity)
-            elif seconds > 2 * _SECONDS_BETWEEN:
-                length = max(1, length // 2)
-            return last, chains, rows
+            return last, chains, jax.tree.map(lambda leaf: np.asarray(leaf)[:new], buffers)
 
         return advance
 
 
-def warn_of_invalid(caller: str, num_invalid: Mapping[str, Any]) -> None:
-    """Warn of densities that were not numbers, by their names."""
-    counts = [f"{name} {np.sum(each)} times" for name, each in num_invalid.items() if np.any(each)]
-    if counts:
-        warn(f"{caller}: NaN or +inf, taken for zero density: {', '.join(counts)}", UserWarning)
+def warn_of_invalid(caller: str, number: int) -> None:
+    """Warn of so many densities that were not numbers."""
+    if number > 0:
+        warn(f"{caller}: a density was NaN or +inf, taken for zero, {number} times", UserWarning)
 
 
 @jit_on_wide_vectors
 def _start_all(kernel, keys, reals, walk):
     """All chains at their starts, which could start, and reports of no steps."""
     states, fine = jax.vmap(kernel.start)(keys, reals)
-    steps = eqx.filter_eval_shape(_all_steps, kernel, keys[0], Chains(states, walk, {}), 0)
-    counts = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jnp.int32), steps.invalid)
-    none = jax.tree.map(lambda leaf: jnp.zeros((0, *leaf.shape), leaf.dtype), steps.report)
-    return Chains(states, walk, counts), fine, none
+    chains = Chains(states, walk, jnp.zeros(len(keys), jnp.int32))
+    report = eqx.filter_eval_shape(_all_steps, kernel, keys[0], chains, 0).report
+    none = jax.tree.map(lambda leaf: jnp.zeros((0, *leaf.shape), leaf.dtype), report)
+    return chains, fine, none
 
 
 def _all_steps(kernel: Any, key: Key[Array, ""], chains: Chains, step: Any) -> Step:
@@ -234,11 +202,13 @@ def _all_steps(kernel: Any, key: Key[Array, ""], chains: Chains, step: Any) -> S
 
 
 @jit_on_wide_vectors
-def _steps(kernel, key, chains, numbers, capacity):
+def _steps(kernel, key, chains, numbers):
     """Some steps of all chains, and their draws: one program for any number of steps."""
     first, last, burn_in = numbers
     report = eqx.filter_eval_shape(_all_steps, kernel, key, chains, 0).report
-    buffers = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), report)
+    buffers = jax.tree.map(
+        lambda leaf: jnp.zeros((_STEPS_AT_ONCE, *leaf.shape), leaf.dtype), report
+    )
 
     def advance(step: Array, carry: tuple[Chains, PyTree]) -> tuple[Chains, PyTree]:
         chains, buffers = carry
@@ -250,12 +220,9 @@ def _steps(kernel, key, chains, numbers, capacity):
             lambda: chains.walk.adapted(points, step, acceptance),
             lambda: chains.walk,
         )
-        counts = jax.tree.map(
-            lambda sum, new: sum + new.astype(sum.dtype), chains.num_invalid, steps.invalid
-        )
         # In the burn-in, in the row of the first draw, which overwrites it.
         row = jnp.maximum(step - jnp.maximum(first, burn_in), 0)
         buffers = jax.tree.map(lambda rows, leaf: rows.at[row].set(leaf), buffers, steps.report)
-        return Chains(steps.state, walk, counts), buffers
+        return Chains(steps.state, walk, chains.num_invalid + steps.num_invalid), buffers
 
     return jax.lax.fori_loop(first, last, advance, (chains, buffers))

@@ -63,15 +63,12 @@ class Point(eqx.Module):
 
 
 def evaluated(
-    reals: Reals,
-    log_prior: Float[Array, ""],
-    log_likelihood: Float[Array, ""],
-    name: str = "log_marginal_likelihood",
-) -> tuple[Point, dict[str, Bool[Array, ""]]]:
-    """The point with these log densities, and which of them was NaN or +inf, by name."""
-    has_prior = (log_prior > -jnp.inf) & (log_prior < jnp.inf)
+    reals: Reals, log_prior: Float[Array, ""], log_likelihood: Float[Array, ""]
+) -> tuple[Point, Bool[Array, ""]]:
+    """The point with these log densities, and whether one of them was NaN or +inf."""
     # Where the prior is zero, the likelihood may not even be defined.
-    invalid = {"log_prior": is_invalid(log_prior), name: has_prior & is_invalid(log_likelihood)}
+    has_prior = (log_prior > -jnp.inf) & (log_prior < jnp.inf)
+    invalid = is_invalid(log_prior) | (has_prior & is_invalid(log_likelihood))
     log_likelihood = jnp.where(has_prior, number_or_zero(log_likelihood), -jnp.inf)
     return Point(reals, number_or_zero(log_prior), log_likelihood), invalid
 
@@ -90,10 +87,8 @@ class LogDensity(eqx.Module):
         """The log density up to a constant; -inf where a part of it is NaN or +inf."""
         return self.evaluated(key, reals)[0].log_density
 
-    def evaluated(
-        self, key: Key[Array, ""], reals: Reals
-    ) -> tuple[Point, dict[str, Bool[Array, ""]]]:
-        """Its two parts, and which of them are no numbers."""
+    def evaluated(self, key: Key[Array, ""], reals: Reals) -> tuple[Point, Bool[Array, ""]]:
+        """Its two parts, and whether one of them is no number."""
         point, invalid = evaluated(reals, self.prior(reals), self.problem.value(key, reals))
         return dataclasses.replace(point, key_data=jax.random.key_data(key)), invalid
 
@@ -236,12 +231,12 @@ def metropolis_step(
     key: Key[Array, ""],
     factor: Float[Array, "d d"],
     point: Point,
-    evaluate: Callable[[Key[Array, ""], Reals], tuple[Point, dict[str, Array]]],
-) -> tuple[Point, Bool[Array, ""], dict[str, Array]]:
-    """A step of the walk u + F z, accepted or not: the point, whether it moved, what was no number.
+    evaluate: Callable[[Key[Array, ""], Reals], tuple[Point, Bool[Array, ""]]],
+) -> tuple[Point, Bool[Array, ""], Bool[Array, ""]]:
+    """A step of the walk u + F z, accepted or not.
 
-    `evaluate` gives the point at other parameters by a key that is always new, and which of its
-    densities were no numbers.
+    It returns the point, whether it moved, and whether a density was no number. `evaluate` gives
+    the point at other parameters by a key that is always new, and the last of these.
     """
     key_walk, key_fresh, key_accept = jax.random.split(key, 3)
     u, unravel = ravel_pytree(point.reals)

@@ -46,22 +46,17 @@ class LogEvidence(eqx.Module):
         runs = self.runs(key, filter)
         return jnp.concatenate([run.log_marginal_likelihood for run in runs])
 
-    def parts(
-        self, size: int, rng: np.random.Generator | None = None
-    ) -> list[tuple[int, np.ndarray]]:
-        """All sequences in parts of one group and at most this size: the group, and which of it.
+    def parts(self, size: int, rng: np.random.Generator | None = None) -> list["LogEvidence"]:
+        """The evidence of all sequences in parts of one group and at most this size.
 
         The parts, and the sequences in them, are in the order of `rng`, or as they stand.
         """
         parts = []
-        for g, group in enumerate(self.groups):
-            rows = np.arange(group.length) if rng is None else rng.permutation(group.length)
-            parts += [(g, part) for part in np.array_split(rows, -(-group.length // size))]
+        for group in self.groups:
+            order = np.arange(group.length) if rng is None else rng.permutation(group.length)
+            for rows in np.array_split(order, -(-group.length // size)):
+                parts.append(type(self)([jax.tree.map(lambda leaf, at=rows: leaf[at], group)]))
         return parts if rng is None else [parts[k] for k in rng.permutation(len(parts))]
-
-    def part(self, group: int, rows: np.ndarray) -> "LogEvidence":
-        """The evidence of some sequences of one group."""
-        return type(self)([jax.tree.map(lambda leaf: leaf[rows], self.groups[group])])
 
     def runs(self, key: Key[Array, ""], filter: Filter, whole: bool = False) -> list[FilterRun]:
         """The runs of each group, with all mixtures collected, or nothing."""

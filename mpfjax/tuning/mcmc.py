@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count, CountOrZero, checked
 from mpfjax.filter import Filter
@@ -39,11 +39,7 @@ _NUM_METROPOLIS_STEPS = 5  # for one new trajectory; they cost little
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Posterior(PosteriorOfChains):
-    """The chains of `metropolis_hastings`, after their burn-in.
-
-    Values that are not finite are counted for a proposal's `log_prior` and
-    `log_marginal_likelihood`.
-    """
+    """The chains of `metropolis_hastings`, after their burn-in."""
 
     log_marginal_likelihoods: Float[np.ndarray, "chains draws"]
     """log Ẑ of every draw, summed over sequences."""
@@ -139,16 +135,13 @@ class _MetropolisHastings(AbstractKernel):
         evaluate = self.density.evaluated
         point, accepted, invalid = metropolis_step(key, walk.factor, state, evaluate)
         report = (point.reals, point.log_likelihood, accepted, point.key_data)
-        return Step(point, report, accepted.astype(point.log_prior.dtype), invalid)
+        acceptance = accepted.astype(point.log_prior.dtype)
+        return Step(point, report, acceptance, invalid.astype(jnp.int32))
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class GibbsPosterior(PosteriorOfChains):
-    """The chains of `particle_gibbs`, after their burn-in.
-
-    Values that are not finite are counted for the `log_prior` and `log_joint` of a proposal, and
-    densities in the `conditional_filter`.
-    """
+    """The chains of `particle_gibbs`, after their burn-in."""
 
     trajectories: PyTree
     """x_0, ..., x_t of every draw, leaves (chains, draws, t + 1, ...)."""
@@ -256,31 +249,34 @@ class _Gibbs(AbstractKernel):
     def step(self, key: Key[Array, ""], state: _Pair, walk: RandomWalk) -> Step:
         """The next pair."""
         key_parameters, key_trajectory = jax.random.split(key)
-        reals, accepted, invalid = self._metropolis(key_parameters, state, walk)
+        reals, accepted, num_invalid = self._metropolis(key_parameters, state, walk)
         filter, series = self.problem.at(reals), self.problem.objective.series
         result = renew(key_trajectory, filter, series, state.trajectory)
         possible = possible_times(filter.model, result.trajectory, series.inputs)
         broken = jnp.any(is_invalid(result.run.log_likelihood_increments))
         broken |= ~jnp.all(result.possible & possible)
         pair = chosen(~broken, _Pair(reals, result.trajectory), state)
-        invalid["conditional_filter"] = broken
 
         def changed(new: Array, old: Array) -> Bool[Array, " times"]:
             return jnp.any((new != old).reshape(new.shape[0], -1), axis=1)
 
         changes = jax.tree.leaves(jax.tree.map(changed, pair.trajectory, state.trajectory))
         renewed = jnp.any(jnp.stack(changes), axis=0)
-        return Step(pair, (pair.reals, pair.trajectory, accepted, renewed), accepted, invalid)
+        report = (pair.reals, pair.trajectory, accepted, renewed)
+        return Step(pair, report, accepted, num_invalid + broken.astype(jnp.int32))
 
     def _metropolis(
         self, key: Key[Array, ""], state: _Pair, walk: RandomWalk
-    ) -> tuple[Reals, Float[Array, ""], dict[str, Array]]:
-        """Steps of the random walk on the parameters given the trajectory."""
+    ) -> tuple[Reals, Float[Array, ""], Int[Array, ""]]:
+        """Steps of the random walk on the parameters given the trajectory.
 
-        def evaluate(key: Key[Array, ""], reals: Reals) -> tuple[Point, dict[str, Array]]:
+        Also the share that is accepted, and how often a density was no number.
+        """
+
+        def evaluate(key: Key[Array, ""], reals: Reals) -> tuple[Point, Bool[Array, ""]]:
             del key
             log_joint = self.problem.objective(state.trajectory, self.problem.at(reals))
-            return evaluated(reals, self.prior(reals), log_joint, "log_joint")
+            return evaluated(reals, self.prior(reals), log_joint)
 
         def move(point: Point, key: Key[Array, ""]) -> tuple[Point, Any]:
             point, *report = metropolis_step(key, walk.factor, point, evaluate)
@@ -288,5 +284,5 @@ class _Gibbs(AbstractKernel):
 
         keys = jax.random.split(key, _NUM_METROPOLIS_STEPS)
         point, (accepted, invalid) = jax.lax.scan(move, evaluate(key, state.reals)[0], keys)
-        counts = jax.tree.map(lambda some: jnp.sum(some, dtype=jnp.int32), invalid)
-        return point.reals, jnp.mean(accepted.astype(jnp.result_type(float))), counts
+        rate = jnp.mean(accepted.astype(jnp.result_type(float)))
+        return point.reals, rate, jnp.sum(invalid, dtype=jnp.int32)

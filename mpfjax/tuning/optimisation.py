@@ -56,7 +56,8 @@ class TuningRun:
     stopped: str | None
     """why it ended before `num_steps`, or None."""
     effective_seeds: Float[np.ndarray, " series"] | None
-    """of `fit`, for each sequence, (Σ Ẑ)² / Σ Ẑ² over seeds at the end: how many of them count."""
+    """of `fit`, for each sequence, (Σ Ẑ)² / Σ Ẑ² over seeds at the end: how many of them count;
+    None if Ẑ was not finite there."""
 
 
 @checked
@@ -132,13 +133,12 @@ def fit(
     )
     data = {"observations": problem.objective, "score": score}
     values, run = ascent.climb(num_steps, progress, data)
+    if values is None:
+        return run
     if pooled:
-        _warn_of_few_seeds(run[3]["effective_seeds"], values)
-    effective = None
-    if values is not None:
-        effective = np.empty(values.shape[1])
-        effective[list(problem.objective.places)] = _effective_seeds(values)
-    return TuningRun(*run, effective_seeds=effective)
+        _warn_of_few_seeds(run.history["effective_seeds"], values)
+    order = np.argsort(problem.objective.places)
+    return replace(run, effective_seeds=_effective_seeds(values)[order])
 
 
 def _effective_seeds(values: Float[np.ndarray, "seeds series"]) -> Float[np.ndarray, " series"]:
@@ -147,10 +147,10 @@ def _effective_seeds(values: Float[np.ndarray, "seeds series"]) -> Float[np.ndar
     return weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0)
 
 
-def _warn_of_few_seeds(history: np.ndarray, values: np.ndarray | None) -> None:
+def _warn_of_few_seeds(history: np.ndarray, values: np.ndarray) -> None:
     """Warn where about one seed decides the likelihood of each series, in the last steps."""
     effective = history[-_LAST_STEPS:].mean()
-    if effective < _FEWEST_SEEDS and values is not None:
+    if effective < _FEWEST_SEEDS:
         spread = values.std(axis=0, ddof=1).mean() if len(values) > 1 else np.nan
         of = f", since log Ẑ has a standard deviation of {spread:.1f}" if len(values) > 1 else ""
         what = f"only {effective:.1f} of {len(values)} seeds count for a series{of}, and the"
@@ -189,8 +189,8 @@ def maximise(
     if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(f"objective: it returns {shown(value)}, no floating point scalar")
     _, run = ascent.climb(num_steps, progress, {"objective": objective})
-    del run[3]["effective_seeds"]  # of values that are no logarithms of likelihoods
-    return TuningRun(*run, effective_seeds=None)
+    del run.history["effective_seeds"]  # of values that are no logarithms of likelihoods
+    return run
 
 
 @dataclass(frozen=True)
@@ -208,8 +208,8 @@ class _Ascent:
 
     def climb(
         self, num_steps: int, progress: bool, data: dict[str, Any]
-    ) -> tuple[Float[np.ndarray, "seeds series"] | None, tuple]:
-        """The objective at the end, and the first fields of a `TuningRun`."""
+    ) -> tuple[Float[np.ndarray, "seeds series"] | None, TuningRun]:
+        """The objective at the end, None where it is not finite, and the result."""
         reals = self.problem.start()
         optimizer = self.optimizer.init(reals)
         no_path = jax.tree.map(lambda u: np.empty((0, *u.shape), u.dtype), reals)
@@ -236,28 +236,21 @@ class _Ascent:
         history = {"value": averages, "deviation": deviations, "effective_seeds": effective}
         history |= self.problem.constrained_rows(path)
         parameters = jax.tree.map(np.asarray, self.problem.constrain(reals))
-        return values, (self.problem.at(reals), parameters, value, history, stopped)
+        return values, TuningRun(self.problem.at(reals), parameters, value, history, stopped, None)
 
-    def _parts(self) -> list[Problem]:
-        """The problem, or one for each batch of series, in the order in which they stand."""
+    def _parts(self, rng: np.random.Generator | None = None) -> list[Problem]:
+        """The problem, or one for each batch of series: in the order of `rng`, or as they stand."""
         if self.batch is None:
             return [self.problem]
-        evidence = self.problem.objective
-        return [self._of(evidence.part(*part)) for part in evidence.parts(self.batch)]
-
-    def _of(self, objective: Any) -> Problem:
-        return replace(self.problem, objective=objective)
+        parts = self.problem.objective.parts(self.batch, rng)
+        return [replace(self.problem, objective=part) for part in parts]
 
     def _at_step(self, step: int) -> tuple[Problem, int]:
         """The problem of a step's batch, and how many batches there are in its epoch."""
-        if self.batch is None:
-            return self.problem, 1
-        evidence = self.problem.objective
-        num_parts = len(evidence.parts(self.batch))
+        num_parts = len(self._parts())
         epoch, place = divmod(step, num_parts)
         seed = np.asarray(jax.random.key_data(self.key)).ravel()
-        parts = evidence.parts(self.batch, np.random.default_rng([*seed, epoch]))
-        return self._of(evidence.part(*parts[place])), num_parts
+        return self._parts(np.random.default_rng([*seed, epoch]))[place], num_parts
 
     def _average(self, values: Float[np.ndarray, "seeds series"]) -> float:
         """The average over seeds, summed over series."""

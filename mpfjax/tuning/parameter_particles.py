@@ -54,8 +54,8 @@ class Sampler(eqx.Module):
 
     def run_again(
         self, key: Key[Array, ""], reals: Reals, num_steps: Int[Array, ""]
-    ) -> tuple[Point, dict[str, Bool[Array, ""]]]:
-        """A θ with a new filter over all observations so far, and what was no number.
+    ) -> tuple[Point, Bool[Array, ""]]:
+        """A θ with a new filter over all observations so far, and whether a density was no number.
 
         One compiled program does for any number of them.
         """
@@ -112,7 +112,7 @@ def rejuvenate(key, sampler, samples, num_steps):
     """Samples of equal weight, from chains that start at resampled ones.
 
     Also from which sample each comes, the share of accepted steps, and how often a density was no
-    number, by name.
+    number.
     """
     key_resample, key_moves = jax.random.split(key)
     points = jax.vmap(lambda reals: ravel_pytree(reals)[0])(samples.particles.reals)
@@ -141,7 +141,6 @@ def rejuvenate(key, sampler, samples, num_steps):
 
     everywhere = jax.tree.map(end_to_end, starts, paths)
     rate = jnp.mean(accepted.astype(samples.log_weights.dtype))
-    counts = jax.tree.map(lambda some: jnp.sum(some, dtype=jnp.int32), invalid)
     ancestors = resampled.ancestor_indices[:num_chains]
     ancestors = jnp.concatenate([ancestors, jnp.repeat(ancestors, num_moves)])
-    return single_component(everywhere), ancestors, rate, counts
+    return single_component(everywhere), ancestors, rate, jnp.sum(invalid, dtype=jnp.int32)

@@ -38,9 +38,9 @@ class SequentialPosterior:
     """of the samples after each observation, before any rejuvenation."""
     acceptance_rates: Float[np.ndarray, " t"]
     """of the moves after each observation, NaN where none were needed."""
-    num_invalid: dict[str, int]
-    """how often `log_prior` or `log_marginal_likelihood` was NaN or +inf: of θs that were dropped,
-    and of proposals that were rejected."""
+    num_invalid: int
+    """how often a prior or likelihood was NaN or +inf: of θs that were dropped, and of proposals
+    that were rejected."""
     stopped: str | None
     """why it ended before the last observation, or None."""
     _end: "tuple[_Run, State]" = field(compare=False)
@@ -204,16 +204,15 @@ def smc2(
     }  # fmt: skip
     run = _Run(sampler, series, key_steps, progress, settings)
     samples = start(jax.random.split(key_filters, num_samples), sampler, reals)
-    num_invalid = {"log_prior": 0, "log_marginal_likelihood": 0}
     rows = np.empty(0), np.empty(0), np.empty(0)
-    return run.posterior(State(0, (samples, np.arange(num_samples), num_invalid), rows))
+    return run.posterior(State(0, (samples, np.arange(num_samples), 0), rows))
 
 
 @dataclass(frozen=True)
 class _Run:
     """SMC² over some observations.
 
-    It carries the samples, their families and the counts of invalid densities. Its rows are the
+    It carries the samples, their families and the number of invalid densities. Its rows are the
     increment, the effective sample size and the acceptance rate of each step.
     """
 
@@ -254,9 +253,8 @@ class _Run:
 
         run = LongRun("smc2", self.series.length, self.progress, settings)
         state, stopped = run.go(start, self._advance)
-        samples, *_, num_invalid = state.carry
-        before = start.carry[-1]
-        warn_of_invalid("smc2", {name: num_invalid[name] - before[name] for name in before})
+        samples, _, num_invalid = state.carry
+        warn_of_invalid("smc2", num_invalid - start.carry[-1])
         return SequentialPosterior(
             self.sampler.problem.constrained_rows(samples.particles.reals),
             np.asarray(samples.log_weights),
@@ -268,22 +266,21 @@ class _Run:
 
     def _advance(self, step: int, last: int, carry: PyTree) -> tuple[int, PyTree, PyTree]:
         """The samples after one more observation."""
-        samples, families, invalid = carry
-        counts, rate = dict(invalid), np.nan
+        samples, families, num_invalid = carry
         keys = jax.random.split(jax.random.fold_in(self.key, step))
         samples, *numbers = extend(keys[0], self.sampler, samples, jnp.asarray(step, jnp.int32))
-        increment, size, num_invalid = map(float, numbers)
-        counts["log_marginal_likelihood"] += int(num_invalid)
+        increment, size, num_dropped = map(float, numbers)
+        num_invalid, rate = num_invalid + int(num_dropped), np.nan
         if increment == -np.inf:
-            broken = f", NaN or +inf in {num_invalid:g}," if num_invalid else ""
+            broken = f", NaN or +inf in {num_dropped:g}," if num_dropped else ""
             raise Broken(f"no sample has any likelihood{broken}")
         if size < _ESS_THRESHOLD * samples.num_particles:
             so_far = jnp.asarray(step + 1, jnp.int32)
-            samples, ancestors, rate, of_moves = rejuvenate(keys[1], self.sampler, samples, so_far)
+            samples, ancestors, rate, invalid = rejuvenate(keys[1], self.sampler, samples, so_far)
             families, rate = families[np.asarray(ancestors)], float(rate)
-            counts = {name: count + int(of_moves[name]) for name, count in counts.items()}
+            num_invalid += int(invalid)
         row = (np.array([number]) for number in (increment, size, rate))
-        return step + 1, (samples, families, counts), tuple(row)
+        return step + 1, (samples, families, num_invalid), tuple(row)
 
 
 def _pad(series: Series, capacity: int) -> Series:

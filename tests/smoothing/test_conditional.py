@@ -10,10 +10,9 @@ from mpfjax import Filter, KMeans, Merge, Propagate, RandomPartition, Resample, 
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.smoothing import conditional_filter
 from tests.marking import quick_of
-from tests.smoothing.registry import MODELS, QUADRATIC
+from tests.smoothing.registry import OBSERVATIONS, QUADRATIC
 from tests.smoothing.test_contracts import NUM_RUNS, exact_trajectories
 
-_, SQUARES = MODELS["two modes"]
 EAGER = (Merge(2.0), Split(1.0, min_distance=0.1, min_share=0.0), KMeans(2))
 
 
@@ -51,8 +50,8 @@ def statistics(trajectories):
 @pytest.mark.parametrize("name", quick_of(CASES, [], one_in=2))
 def test_exact_draws_stay_exact_and_much_is_new(name):
     """The mean change of every moment is zero, within four standard errors."""
-    filter, before = CASES[name], exact_trajectories("two modes")
-    series = mpfjax.Series.skipping(jnp.asarray(SQUARES))
+    filter, before = CASES[name], exact_trajectories()
+    series = mpfjax.Series.skipping(jnp.asarray(OBSERVATIONS))
 
     @jax.jit
     @jax.vmap
@@ -105,14 +104,6 @@ ONES = np.ones(3, np.float32)
 def call(trajectory=(0.5, 0.6, 0.7, 0.8), n=6, observations=ONES):
     filter, path = mpfjax.particle_filter(Walled(), n), jnp.asarray(trajectory, jnp.float32)
     return conditional_filter(jax.random.key(0), filter, observations, path)
-
-
-@pytest.mark.exactness
-def test_one_particle_and_none_seen():
-    unseen = call(observations=mpfjax.Series.skipping(np.full(3, np.nan, np.float32)))
-    assert float(unseen.run.log_marginal_likelihood) == 0.0
-    one = call((0.5, 0.6), n=1, observations=ONES[:1])
-    np.testing.assert_array_equal(one.trajectory, np.float32([0.5, 0.6]))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Forecasts against the Kalman filter's prediction."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,8 +72,4 @@ def test_predictions_of_each_step_are_the_kalman_filters():
         error = np.sqrt((spread + noise) / run.effective_sample_size.min())
         assert np.all(np.abs(found - 0.9 * before) < 4 * error)
     with pytest.raises(ValueError, match="run: it has not the mixtures of one run"):
-        mpfjax.one_step_predictions(
-            jax.random.key(2),
-            filter,
-            mpfjax.run_filter(jax.random.key(1), filter, SEEN, lambda mixture: None),
-        )
+        mpfjax.one_step_predictions(jax.random.key(2), filter, replace(run, collected=None))

@@ -1,13 +1,16 @@
-"""Trajectories of mixtures alone, and genealogies."""
+"""Trajectories of mixtures alone, genealogies, and warnings where backward sampling degenerates."""
+
+import warnings
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.scipy.stats import norm
 
 import mpfjax
-from mpfjax.smoothing import backward, sample_trajectories, smoothed_sums, trace_ancestors
+from mpfjax.smoothing import backward, sample_trajectories, trace_ancestors
 
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
 SQUARES = np.array([1.2, 0.8, 1.5, 1.0], np.float32)
@@ -80,7 +83,7 @@ def test_what_follows_ancestors_refuses_particles_without_one_parent():
     filter, seen = mpfjax.gaussian_particle_filter(QUADRATIC, 50), jnp.full(3, 1.5)
     run = mpfjax.run_filter(jax.random.key(0), filter, seen)
     assert (run.collected.ancestor_indices == -1).all()
-    key, total = jax.random.key(1), lambda before, states: states
+    key = jax.random.key(1)
     for follow, named in (
         (lambda run: trace_ancestors(run), "trace_ancestors follows"),
         (lambda run: sample_trajectories(key, filter, run, 9, method="mcmc"), "method 'mcmc'"),
@@ -89,10 +92,6 @@ def test_what_follows_ancestors_refuses_particles_without_one_parent():
             follow(run)
         paths = jax.jit(follow)(run)
         assert np.isnan(getattr(paths, "trajectories", paths)).all()
-    with pytest.raises(ValueError, match=r"leaves no particle one parent.* smoothed_sums"):
-        smoothed_sums(key, filter, seen, total, method="mcmc")
-    with pytest.raises(ValueError, match=r"leaves no particle one parent.* with_eve"):
-        mpfjax.with_eve_indices(filter)
 
 
 class Bounded(NoTransition):
@@ -113,3 +112,61 @@ def test_a_step_that_no_particle_can_have_taken_is_an_error(method):
     filter = mpfjax.particle_filter(Bounded(), 30)
     with pytest.raises(RuntimeError, match="log_transition is -inf"):
         sample_trajectories(jax.random.key(0), filter, mixtures, 3, method=method)
+
+
+class Odometer(mpfjax.AbstractStateSpaceModel):
+    """The state of two times; x_t - x_{t-1} is seen."""
+
+    def sample_initial(self, key, num_particles):
+        now = jax.random.normal(key, (num_particles,))
+        return {"now": now, "before": now}
+
+    def sample_transition(self, key, states):
+        noise = 0.5 * jax.random.normal(key, states["now"].shape)
+        return {"now": 0.9 * states["now"] + noise, "before": states["now"]}
+
+    def log_transition(self, states, previous_states):
+        density = norm.logpdf(states["now"], 0.9 * previous_states["now"], 0.5)
+        return jnp.where(states["before"] == previous_states["now"], density, -jnp.inf)
+
+    def log_likelihood(self, observation, states):
+        return norm.logpdf(observation, states["now"] - states["before"], 0.3)
+
+
+def test_a_delta_is_warned_of_with_the_share_of_distinct_trajectories():
+    steps = np.random.default_rng(0).normal(0, 0.5, 30).astype(np.float32)
+    filter = mpfjax.particle_filter(Odometer(), 200)
+    run = mpfjax.run_filter(jax.random.key(0), filter, steps)
+    with pytest.warns(RuntimeWarning, match="backward weights degenerate") as caught:
+        paths = sample_trajectories(jax.random.key(1), filter, run, 200)
+    num_distinct = len(np.unique(paths["now"][:, 0]))
+    assert caught[0].filename == __file__
+    assert num_distinct < 20
+    share = f"a share of {num_distinct / 200:.2g}"
+    assert f"{num_distinct} of the 200 trajectories are distinct, {share}" in str(caught[0].message)
+
+
+class Known(mpfjax.AbstractStateSpaceModel):
+    """Every particle starts at 0, and few fit what is seen at first."""
+
+    def sample_initial(self, key, num_particles):
+        return jnp.zeros(num_particles)
+
+    def sample_transition(self, key, states):
+        return states + jax.random.normal(key, states.shape)
+
+    def log_transition(self, states, previous_states):
+        return norm.logpdf(states, previous_states)
+
+    def log_likelihood(self, observation, states):
+        return norm.logpdf(observation, states, 0.02)
+
+
+@pytest.mark.exactness
+def test_few_states_that_have_many_pasts_are_no_reason():
+    observations = np.cumsum(np.random.default_rng(1).normal(size=20)).astype(np.float32)
+    filter = mpfjax.particle_filter(Known(), 300)
+    run = mpfjax.run_filter(jax.random.key(0), filter, observations)
+    with warnings.catch_warnings(action="error", category=RuntimeWarning):
+        paths = sample_trajectories(jax.random.key(1), filter, run, 1000)
+    assert min(len(np.unique(column)) for column in np.asarray(paths).T[1:]) < 20

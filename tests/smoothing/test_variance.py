@@ -1,4 +1,4 @@
-"""Errors of log Ẑ and of masses from one run, against many runs and the exact pairs of one."""
+"""Errors of log Ẑ and of masses: of one run, against many runs and its exact pairs; of a batch."""
 
 from dataclasses import replace
 from functools import cache
@@ -11,7 +11,11 @@ import pytest
 import mpfjax
 from mpfjax import Filter, KMeans, Propagate, Resample
 from mpfjax.exact import kalman_filter
-from mpfjax.smoothing.variance import log_marginal_likelihood_variance, mixture_weight_errors
+from mpfjax.smoothing.variance import (
+    batch_estimate,
+    log_marginal_likelihood_variance,
+    mixture_weight_errors,
+)
 from tests.marking import quick_of, weekly
 from tests.registry import RandomLabels
 
@@ -135,12 +139,34 @@ def test_averages_of_pairs_are_close_to_the_pairs_themselves(num_components):
 
 
 @pytest.mark.exactness
-def test_one_step_nothing_seen_and_zero_likelihood():
+def test_one_step_and_zero_likelihood():
     filter = mpfjax.with_eve_indices(mpfjax.particle_filter(SQUARE, 40, **DRAWS))
     one = mpfjax.run_filter(jax.random.key(1), filter, SQUARES[:1])
     assert np.isfinite(log_marginal_likelihood_variance(one))
-    unseen = mpfjax.run_filter(jax.random.key(1), filter, np.full(3, np.nan), missing="skip")
-    assert float(log_marginal_likelihood_variance(unseen)) == pytest.approx(0, abs=1e-6)
     lost = mpfjax.run_filter(jax.random.key(1), filter, np.float32([1.0, 1e30, 1.0]))
     assert lost.degenerate.any()
     assert float(log_marginal_likelihood_variance(lost)) == np.inf
+
+
+@pytest.mark.weekly
+def test_a_batch_is_the_jackknife_of_ratios():
+    def above(mixture):
+        return mixture.expectation(mixture.particles > 0)
+
+    filter = mpfjax.mixture_particle_filter(SQUARE, 100, 2)
+    keys = jax.random.split(jax.random.key(0), 8)
+    runs = mpfjax.monte_carlo(keys, filter, np.float32([0.1, 0.2, 0.3]), nothing)
+    found = batch_estimate(runs, above)
+    weights = np.exp(np.asarray(runs.log_marginal_likelihood, float))
+    values = np.asarray(jax.vmap(above)(runs.final), float)
+    np.testing.assert_allclose(found.value, np.average(values, weights=weights), rtol=1e-4)
+    np.testing.assert_allclose(found.log_marginal_likelihood, np.log(weights.mean()), rtol=1e-4)
+    without = [np.arange(8) != b for b in range(8)]
+    for mine, parts in (
+        (found.error, [np.average(values[kept], weights=weights[kept]) for kept in without]),
+        (found.log_marginal_likelihood_error, [np.log(weights[kept].mean()) for kept in without]),
+    ):
+        np.testing.assert_allclose(mine, np.sqrt(7 * np.var(parts)), rtol=1e-3)
+    np.testing.assert_allclose(
+        found.effective_runs, weights.sum() ** 2 / np.sum(weights**2), rtol=1e-4
+    )

@@ -10,7 +10,6 @@ from jax.scipy.stats import norm
 
 import mpfjax
 from mpfjax import Filter, KMeans, Merge, Propagate, Resample, Split
-from mpfjax.exact import grid_filter
 from tests.user_models import ScalarLinear
 
 # The coefficient a of a linear model, with known inputs and a missing observation.
@@ -19,10 +18,6 @@ INPUTS = jnp.array([0.6, -0.7, 0.2, 0.9, -0.3, 0.5, -0.8, 0.1])
 SERIES = mpfjax.Series.skipping(OBSERVATIONS, INPUTS)
 MEAN_OF_A, DEVIATION_OF_A = 0.3, 0.5
 A = {"a": lambda filter: filter.model.a}
-# The noise σ of the quadratic model's observations.
-SQUARES = jnp.array([1.2, 0.3, 0.8, 1.6, 1.0])
-SIGMA = {"sigma_y": lambda filter: filter.model.sigma_y}
-MEAN_OF_LOG_SIGMA, DEVIATION_OF_LOG_SIGMA = -0.5, 0.7
 
 
 class Pushed(ScalarLinear):
@@ -51,11 +46,6 @@ def log_prior_of_a(parameters):
     return norm.logpdf(parameters["a"], MEAN_OF_A, DEVIATION_OF_A)
 
 
-def log_prior_of_sigma(parameters):
-    log_sigma = jnp.log(parameters["sigma_y"])
-    return norm.logpdf(log_sigma, MEAN_OF_LOG_SIGMA, DEVIATION_OF_LOG_SIGMA) - log_sigma
-
-
 def eager_mixture(num_particles=10):
     """A filter of the quadratic model that merges, splits and regroups at every step."""
     model = mpfjax.QuadraticModel(0.4, 0.7, -2.0, 2.0)
@@ -75,16 +65,6 @@ class Exact(NamedTuple):
     mean: float
     variance: float
     log_evidence: float
-
-
-def _summary(grid, log_densities):
-    grid, log_densities = np.asarray(grid, float), np.asarray(log_densities, float)
-    density = np.exp(log_densities - log_densities.max())
-    total = density.sum()
-    density /= total
-    mean = density @ grid
-    log_evidence = np.log(total * (grid[1] - grid[0])) + log_densities.max()
-    return Exact(mean, density @ (grid - mean) ** 2, log_evidence)
 
 
 def log_evidence_of(model):
@@ -108,18 +88,9 @@ def posterior_of_a(low=-1.7, high=2.3, r=0.5):
         return log_prior_of_a({"a": a}) + log_evidence_of(ScalarLinear(a=a, r=r))
 
     grid = jnp.linspace(low, high, 402)[1::2]
-    return _summary(grid, jax.jit(jax.vmap(log_density))(grid))
-
-
-@cache
-def posterior_of_log_sigma():
-    """By the grid filter."""
-    states = jnp.linspace(-5.0, 5.0, 301)
-
-    def log_density(log_sigma):
-        model = mpfjax.QuadraticModel(0.4, jnp.exp(log_sigma), -2.0, 2.0)
-        evidence = grid_filter(model, SQUARES, states).log_marginal_likelihood
-        return evidence + norm.logpdf(log_sigma, MEAN_OF_LOG_SIGMA, DEVIATION_OF_LOG_SIGMA)
-
-    grid = jnp.linspace(-3.5, 2.5, 61)
-    return _summary(grid, jax.jit(jax.vmap(log_density))(grid))
+    log_densities = np.asarray(jax.jit(jax.vmap(log_density))(grid), float)
+    grid, density = np.asarray(grid, float), np.exp(log_densities - log_densities.max())
+    total = density.sum()
+    mean = density @ grid / total
+    log_evidence = np.log(total * (grid[1] - grid[0])) + log_densities.max()
+    return Exact(mean, density @ (grid - mean) ** 2 / total, log_evidence)

@@ -97,10 +97,10 @@ def interrupt_after(monkeypatch, steps):
     """Ctrl-C once so many steps are made."""
     real = chains_of._steps
 
-    def interrupted(kernel, key, chains, numbers, capacity):
+    def interrupted(kernel, key, chains, numbers):
         if int(numbers[0]) >= steps:
             raise KeyboardInterrupt
-        return real(kernel, key, chains, numbers, capacity)
+        return real(kernel, key, chains, numbers)
 
     monkeypatch.setattr(chains_of, "_steps", interrupted)
 

@@ -1,17 +1,13 @@
-"""What is tuned is log Ẑ of a run: with inputs, with missing numbers, and with the exact score."""
+"""What is tuned is log Ẑ of a run, with missing numbers, and with the exact score."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.exact import kalman_filter
-from mpfjax.tuning import log_density
 from mpfjax.tuning.evidence import pose_evidence
 from mpfjax.tuning.problem import scores
 from tests.marking import exactness
-from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, in_matrices
 from tests.tuning.exact_posteriors import SERIES, Pushed, eager_mixture, log_evidence_of
 from tests.user_models import ScalarLinear, TwoSensors
 
@@ -28,31 +24,6 @@ def test_a_missing_number_is_the_models_to_deal_with(missing):
     run = mpfjax.run_filter(key, filter, SEEN, lambda mixture: None, missing=missing)
     (found,), _ = scores(KEY[None], problem, problem.start(), pooled=False)
     np.testing.assert_allclose(found, run.log_marginal_likelihood, rtol=1e-4)
-
-
-@pytest.mark.exactness
-def test_the_score_of_a_controls_coefficient_is_that_of_kalmans_filter():
-    """The gradient that other libraries' samplers take: times Ẑ it is unbiased, over seeds."""
-
-    def log_prior(parameters):
-        return -0.5 * parameters["gain"] ** 2
-
-    def exact(gain):
-        model, inputs = in_matrices(gain)
-        run = kalman_filter(model, mpfjax.Series(OBSERVATIONS[:, None], inputs))
-        return run.log_marginal_likelihood + log_prior({"gain": gain})
-
-    filter = mpfjax.particle_filter(Driven(), 100, gradient="stop")
-    series = mpfjax.Series(OBSERVATIONS, INPUTS)
-    density = log_density(filter, series, log_prior=log_prior, parameters=GAIN)
-    score = jax.jit(jax.vmap(jax.value_and_grad(density), (None, 0)))
-    for gain in (0.0, 1.2):
-        values, slopes = score({"gain": jnp.array(gain)}, jax.random.split(KEY, 1000))
-        value, slope = jax.value_and_grad(exact)(gain)
-        errors = np.exp(np.asarray(values, float) - value) * (np.asarray(slopes["gain"]) - slope)
-        standard = errors.std() / np.sqrt(len(errors))
-        assert 0 < standard < 0.3
-        assert abs(errors.mean()) < 4 * standard
 
 
 @pytest.mark.parametrize("name", ["particle filter", *exactness(["mixture"])])

@@ -115,12 +115,6 @@ STILL = optax.sgd(0.0)
 class TestPooling:
     """Model parameters maximise Σ log mean Ẑ over seeds; a proposal's, the mean of log Ẑ."""
 
-    def test_a_series_with_one_possible_seed_is_not_corrected(self):
-        values = jnp.array([[0.5], [-jnp.inf], [-jnp.inf]])
-        assert averages(values, pooled=True)[0] == pytest.approx(0.5 - np.log(3))
-        slopes = jax.grad(lambda values: averages(values, pooled=True)[0])(values)
-        np.testing.assert_allclose(slopes[:, 0], [1, 0, 0])
-
     def test_the_objective_is_the_jackknife_of_the_log_of_the_mean(self):
         """3 log (1/3 Σ Ẑ) - 2 times its mean over pairs of seeds, and the gradient of that."""
         problem = pose_evidence(small(8), SEVERAL, NOISE, {"r": Positive()})
@@ -159,11 +153,15 @@ class TestPooling:
         assert plain < -30 * standard
         assert abs(found.mean()) < abs(plain) / 4 + 4 * standard
 
-    def test_a_seed_far_above_the_others_has_a_finite_value_and_gradient(self):
-        values = jnp.array([[0.0], [-1e3], [-2e3]])
+    @pytest.mark.parametrize("other", [-1e3, -np.inf])
+    def test_a_seed_far_above_the_others_has_a_finite_value_and_gradient(self, other):
+        """Without the others there is nothing to correct by."""
+        values = jnp.array([[0.5], [other], [other]])
         value, gradient = jax.value_and_grad(lambda v: averages(v, True)[0])(values)
         assert jnp.isfinite(value)
         np.testing.assert_allclose(jnp.sum(gradient), 1.0, rtol=1e-5)
+        if np.isinf(other):
+            assert value == pytest.approx(0.5 - np.log(3))
 
     def test_its_value_and_the_seeds_that_count_are_those_of_each_series(self):
         options = {"observations": SEVERAL, "optimizer": STILL, "start": {"num_particles": 4}}
@@ -233,7 +231,7 @@ def test_standard_errors_are_of_all_series():
     rows = [y.astype(float) for y in np.random.default_rng(0).normal(size=(5, 40))]
     r = float(np.sqrt(np.mean(np.square(rows))))
     filter = mpfjax.particle_filter(Constant(r=r), 2, gradient="stop")
-    found = standard_errors(jax.random.key(0), filter, rows, parameters=NOISE, num_seeds=4)
+    found = standard_errors(jax.random.key(0), filter, rows, parameters=NOISE, num_seeds=20)
     assert found["r"] == pytest.approx(r / np.sqrt(2 * 200), rel=0.02)
 
 
@@ -254,9 +252,7 @@ class TestResuming:
             ({"num_seeds": 2}, "num_seeds is 4 there and 2 here"),
             ({"score": "fisher"}, "score is filter there and fisher here"),
             ({"start": {"r": 0.7}}, r"filter\.model\.r is .* 0\.5 there and .* 0\.7 here"),
-            ({"start": {"q": 0.7}}, r"filter\.model\.q is"),
             ({"start": {"num_particles": 8}}, r"filter\.num_particles is 16 there and 8 here"),
-            ({"start": {"gradient": "none"}}, r"filter\.moves\[0\]\.gradient is"),
             ({"observations": OBSERVATIONS.at[3].add(1e-6)}, r"observations.* is"),
             ({"key": jax.random.key(1)}, "key is"),
             ({"transforms": {"r": Interval(0.0, 9.0)}}, r"transforms\['r'\]"),
@@ -270,16 +266,12 @@ class TestResuming:
         ):
             short_fit(path=tmp_path / "fit.npz", **other)
 
-    @pytest.mark.parametrize(
-        ("num_steps", "step", "last", "score"),
-        [(6, 0.2, 3, "filter"), (1, 1.0, 1, "filter"), (6, 0.2, 3, "fisher")],
-    )
+    @pytest.mark.parametrize(("num_steps", "step", "last"), [(6, 0.2, 3), (1, 1.0, 1)])
     def test_a_fit_that_broke_has_the_last_good_parameters_and_stays(
-        self, tmp_path, num_steps, step, last, score
+        self, tmp_path, num_steps, step, last
     ):
         """In the middle, or where its end was evaluated."""
         options = {"optimizer": falling(step), "path": tmp_path / "fit.npz"}
-        options["score"] = score
         with pytest.warns(UserWarning, match=f"was nan at step {last}"):
             first = short_fit(num_steps, **options)
         assert first.stopped == f"the log marginal likelihood was nan at step {last}"
@@ -291,15 +283,6 @@ class TestResuming:
         with pytest.warns(UserWarning, match="was nan at step"):
             assert_same(short_fit(num_steps + 5, **options), first)
         assert (tmp_path / "fit.npz").read_bytes() == before
-
-    def test_a_schedule_that_writes_into_its_closure_goes_on(self, tmp_path):
-        """As optax's cosine does when it is first called, in this process and in a new one."""
-        make = lambda: optax.adam(optax.cosine_decay_schedule(0.05, 10))  # noqa: E731
-        options = {"path": tmp_path / "fit.npz"}
-        optimizer = make()
-        short_fit(2, optimizer=optimizer, **options)
-        short_fit(3, optimizer=optimizer, **options)
-        assert_same(short_fit(4, optimizer=make(), **options), short_fit(4, optimizer=make()))
 
 
 def assert_same(run, other):

@@ -95,6 +95,15 @@ def by_gibbs():
     return particle_gibbs(KEY, FILTER, SERIES, 200, proposal_deviations=0.8, **PRIOR, **CHAINS)
 
 
+class NoDensity(Drifting):
+    log_transition = None
+
+
+def by_genealogy():
+    filter = mpfjax.particle_filter(NoDensity(), 20)
+    return metropolis_hastings(KEY, filter, SERIES, 200, proposal_deviations=0.8, **PRIOR, **CHAINS)
+
+
 def by_smc2():
     return smc2(KEY, FILTER, SERIES, 4000, num_moves=3, **PRIOR, **OF_D)
 
@@ -110,7 +119,7 @@ def z_scores(values, mean, variance, independent=None):
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize("sample", [by_metropolis, *weekly([by_gibbs, by_smc2])])
+@pytest.mark.parametrize("sample", [by_metropolis, *weekly([by_gibbs, by_genealogy, by_smc2])])
 def test_means_and_variances_are_the_exact_ones(sample):
     """Within four standard errors, over chains; of `smc2`, by its effective sample size."""
     run = sample()
@@ -121,53 +130,4 @@ def test_means_and_variances_are_the_exact_ones(sample):
         independent = run.effective_sample_sizes.min() if sample is by_smc2 else None
         z = z_scores(values, mean, variance, independent)
         assert z.shape == (2, len(mean))
-        assert np.abs(z).max() < 4, z
-
-
-class Steps(mpfjax.AbstractStateSpaceModel):
-    """A place of which the steps are seen, x_t - x_{t-1}: the state carries the last one."""
-
-    d: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
-
-    def sample_initial(self, key, num_particles):
-        places = jax.random.normal(key, (num_particles,))
-        return jnp.column_stack([places, jnp.zeros(num_particles)])
-
-    def sample_transition(self, key, states):
-        before = states[:, 0]
-        places = 0.8 * before + self.d + 0.7 * jax.random.normal(key, before.shape)
-        return jnp.column_stack([places, places - before])
-
-    def log_likelihood(self, observation, states):
-        return norm.logpdf(observation, states[:, 1], 0.5)
-
-    def sample_observation(self, key, states):
-        return states[:, 1] + 0.5 * jax.random.normal(key, states[:, 1].shape)
-
-
-@pytest.mark.weekly
-def test_what_is_seen_of_a_step_is_a_number_of_the_state():
-    """Places and steps, by the genealogy, beside the Kalman smoother of (x_t, x_{t-1}, d)."""
-    seen = np.float32([1.2, 0.3, 0.8])
-    run = metropolis_hastings(
-        KEY, mpfjax.particle_filter(Steps(), 20), seen, 200, proposal_deviations=0.8, **PRIOR,
-        **CHAINS,
-    )  # fmt: skip
-    exact = kalman_smoother(
-        mpfjax.LinearGaussianModel(
-            A=[[0.8, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], Q=np.diag([0.49, 0.0, 0.0]),
-            H=[[1.0, -1.0, 0.0]], R=[[0.25]], m0=np.zeros(3), P0=np.eye(3),
-        ), seen[:, None],
-    )  # fmt: skip
-    past = posterior_trajectories(jax.random.key(1), run)
-    step = np.float32([1.0, -1.0, 0.0])
-    means, covariances = np.asarray(exact.means), np.asarray(exact.covariances)
-    variances = np.einsum("i,tij,j->t", step, covariances, step)[1:]
-    expected = [
-        (past.states[..., 0], means[:, 0], covariances[:, 0, 0]),
-        (past.states[:, :, 1:, 1], means[1:] @ step, variances),
-        (past.observations, means[1:] @ step, variances + 0.25),
-    ]
-    for values, mean, variance in expected:
-        z = z_scores(values, mean, variance)
         assert np.abs(z).max() < 4, z

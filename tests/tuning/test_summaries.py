@@ -44,7 +44,8 @@ def posterior(one_start=False):
     accepted[:, ::4] = True
     return Posterior(
         parameters=draws, accepted=accepted, log_marginal_likelihoods=draws["a"],
-        stopped=None, num_invalid={}, problem=None, one_start=one_start, key_data=None,
+        stopped=None, num_invalid=np.zeros(2, int), problem=None, key_data=None,
+        one_start=one_start,
     )  # fmt: skip
 
 
