@@ -5,7 +5,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import checked, kinds
@@ -168,17 +167,10 @@ def shape_of_trajectory(model: Any, length: int) -> PyTree:
 
 
 def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> PyTree:
-    """The trajectory as arrays of the states' types; a `ValueError` for one of other shapes."""
+    """The trajectory as arrays; a `ValueError` for one of other shapes or types than the states."""
     like, arrays = shape_of_trajectory(model, length), rows_of(trajectory, "trajectory")
-
-    def convert(leaf: Any, state: jax.ShapeDtypeStruct) -> Any:
-        may_be = np.can_cast(jnp.result_type(leaf), state.dtype, "same_kind")
-        return jnp.asarray(leaf, state.dtype) if may_be else leaf
-
-    if jax.tree.structure(arrays) == jax.tree.structure(like):
-        arrays = jax.tree.map(convert, arrays, like)
     if kinds(arrays) != kinds(like):
         raise ValueError(
             f"trajectory: {kinds(arrays)} is not {kinds(like)}, x_0 and a state per step"
         )
-    return arrays
+    return jax.tree.map(jnp.asarray, arrays)

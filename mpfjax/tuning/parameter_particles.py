@@ -38,20 +38,6 @@ class Sampler(eqx.Module):
     prior: Prior
     num_moves: int = eqx.field(static=True)
 
-    def start(self, key: Key[Array, ""], reals: Reals) -> Point:
-        """A θ with the mixture of x_0."""
-        mixture = first_mixture(key, self.problem.at(reals), self.series)
-        nothing = jnp.zeros((), mixture.log_weights.dtype)
-        return Point(reals, number_or_zero(self.prior(reals)), nothing, mixture)
-
-    def extend(
-        self, key: Key[Array, ""], sample: Point, t: Int[Array, ""]
-    ) -> tuple[Point, Float[Array, ""]]:
-        """The sample after one more observation, and its increment."""
-        mixture, increment = self._step(key, self.problem.at(sample.reals), sample.mixture, t)
-        log_likelihood = sample.log_likelihood + number_or_zero(increment)
-        return Point(sample.reals, sample.log_prior, log_likelihood, mixture), increment
-
     def run_again(
         self, key: Key[Array, ""], reals: Reals, num_steps: Int[Array, ""]
     ) -> tuple[Point, Bool[Array, ""]]:
@@ -64,7 +50,7 @@ class Sampler(eqx.Module):
 
         def advance(t: Int[Array, ""], carry: tuple) -> tuple:
             mixture, log_evidence = carry
-            mixture, increment = self._step(jax.random.fold_in(key_steps, t), filter, mixture, t)
+            mixture, increment = self.step(jax.random.fold_in(key_steps, t), filter, mixture, t)
             return mixture, log_evidence + increment
 
         start = first_mixture(key_start, filter, self.series)
@@ -73,7 +59,7 @@ class Sampler(eqx.Module):
         point, invalid = evaluated(reals, self.prior(reals), log_evidence)
         return dataclasses.replace(point, mixture=mixture), invalid
 
-    def _step(
+    def step(
         self, key: Key[Array, ""], filter: Filter, mixture: ParticleMixture, t: Int[Array, ""]
     ) -> tuple[ParticleMixture, Float[Array, ""]]:
         """The mixture after one more observation, and the increment of log Ẑ."""
@@ -84,8 +70,14 @@ class Sampler(eqx.Module):
 
 @jit_on_wide_vectors
 def start(keys, sampler, reals):
-    """The samples as particles of equal weight, in one component."""
-    return single_component(jax.vmap(sampler.start)(keys, reals))
+    """Each θ with the mixture of x_0, as particles of equal weight in one component."""
+
+    def one(key: Key[Array, ""], reals: Reals) -> Point:
+        mixture = first_mixture(key, sampler.problem.at(reals), sampler.series)
+        nothing = jnp.zeros((), mixture.log_weights.dtype)
+        return Point(reals, number_or_zero(sampler.prior(reals)), nothing, mixture)
+
+    return single_component(jax.vmap(one)(keys, reals))
 
 
 @jit_on_wide_vectors
@@ -95,15 +87,19 @@ def extend(key, sampler, samples, t):
     A θ whose likelihood is no number gets the weight zero, and keeps it. Also the log of the mean
     increment (-inf where all are zero), the effective sample size, and how many were dropped.
     """
-    keys = jax.random.split(key, samples.num_particles)
-    extend = jax.vmap(sampler.extend, in_axes=(0, 0, None))
-    points, increments = extend(keys, samples.particles, t)
-    alive = samples.log_weights > -jnp.inf
-    log_weights = samples.log_weights + number_or_zero(increments)
-    log_weights = jnp.where(alive, log_weights, -jnp.inf)
+
+    def one(key: Key[Array, ""], sample: Point) -> tuple[ParticleMixture, Float[Array, ""]]:
+        return sampler.step(key, sampler.problem.at(sample.reals), sample.mixture, t)
+
+    points, alive = samples.particles, samples.log_weights > -jnp.inf
+    mixtures, increments = jax.vmap(one)(jax.random.split(key, samples.num_particles), points)
+    num_invalid = jnp.sum(alive & is_invalid(increments), dtype=jnp.int32)
+    increments = number_or_zero(increments)
+    log_likelihood = points.log_likelihood + increments
+    points = dataclasses.replace(points, mixture=mixtures, log_likelihood=log_likelihood)
+    log_weights = jnp.where(alive, samples.log_weights + increments, -jnp.inf)
     total = log_sum_exp(log_weights)
     samples = samples.replace(particles=points, log_weights=log_weights - total)
-    num_invalid = jnp.sum(alive & is_invalid(increments), dtype=jnp.int32)
     return samples, total, samples.effective_sample_size, num_invalid
 
 
