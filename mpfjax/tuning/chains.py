@@ -134,7 +134,7 @@ class Sampling:
         draws = jax.tree.map(lambda rows: rows[: self.num_steps], state.rows)
         reals, *rest = jax.tree.map(lambda rows: np.moveaxis(rows, 0, 1), draws)
         num_invalid = np.asarray(state.carry.num_invalid)
-        warn_of_invalid(self.caller, num_invalid.sum())
+        warn_of_invalid(self.caller, int(num_invalid.sum()))
         return rest, {
             "parameters": self.problem.constrained_rows(reals), "problem": self.problem,
             "num_invalid": num_invalid, "stopped": stopped,

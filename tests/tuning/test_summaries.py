@@ -5,9 +5,12 @@ import pytest
 from scipy.signal import lfilter
 
 from mpfjax.tuning.mcmc import Posterior
+from mpfjax.tuning.problem import pose
 from mpfjax.tuning.summaries import effective_sample_size, row_of, split_r_hat
+from tests.user_models import ScalarLinear
 
 RNG = np.random.default_rng(0)
+PROBLEM = pose(ScalarLinear(), len, None, None)
 
 
 @pytest.mark.parametrize("a", [0.0, 0.5, 0.9])
@@ -44,7 +47,7 @@ def posterior(one_start=False):
     accepted[:, ::4] = True
     return Posterior(
         parameters=draws, accepted=accepted, log_marginal_likelihoods=draws["a"],
-        stopped=None, num_invalid=np.zeros(2, int), problem=None, key_data=None,
+        stopped=None, num_invalid=np.zeros(2, int), problem=PROBLEM, key_data=None,
         one_start=one_start,
     )  # fmt: skip
 
