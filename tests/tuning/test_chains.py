@@ -118,6 +118,7 @@ def test_interrupted_anywhere_the_draws_are_those_of_one_run(tmp_path, monkeypat
         interrupt_after(patch, 5)
         with pytest.raises(KeyboardInterrupt):
             blind(15, **WHOLE)
+    with monkeypatch.context() as patch, file:
         interrupt_after(patch, 14)
         with pytest.warns(UserWarning, match=r"interrupted at step \d+ of 24"):
             part = blind(15, **WHOLE)
