@@ -15,28 +15,20 @@ from tests.user_models import ScalarLinear
 SERIES = Series.skipping(OBSERVATIONS)
 
 
-def sample(num_samples=60, *, key=None, filter=None, observations=SERIES, **options):
-    options = {
+FILTER = mpfjax.particle_filter(ScalarLinear(), 10)
+
+
+def sample(**options):
+    return smc2(**{
+        "key": jax.random.key(0), "filter": FILTER, "observations": SERIES, "num_samples": 60,
         "sample_prior": sample_a, "log_prior": log_prior_of_a, "parameters": A, "num_moves": 5,
         "progress": False,
-    } | options  # fmt: skip
-    filter = mpfjax.particle_filter(ScalarLinear(), 10) if filter is None else filter
-    key = jax.random.key(0) if key is None else key
-    arguments = {"key": key, "filter": filter, "observations": observations}
-    return smc2(**arguments | {"num_samples": num_samples} | options)
+    } | options)  # fmt: skip
 
 
 def part(first, last):
     """Some of the observations."""
     return Series.skipping(OBSERVATIONS[first:last])
-
-
-@pytest.mark.exactness
-def test_one_step_and_no_observation_at_all():
-    """Without observations the samples are those of the prior."""
-    run = sample(observations=Series.skipping(jnp.full(1, jnp.nan)))
-    assert run.log_marginal_likelihood == pytest.approx(0.0, abs=1e-5)
-    np.testing.assert_allclose(run.weights, 1 / 60, rtol=1e-5)
 
 
 class Faulty(ScalarLinear):
