@@ -49,13 +49,8 @@ def log_prior_of_a(parameters):
 def eager_mixture(num_particles=10):
     """A filter of the quadratic model that merges, splits and regroups at every step."""
     model = mpfjax.QuadraticModel(0.4, 0.7, -2.0, 2.0)
-    moves = [
-        Resample(),
-        Propagate(),
-        Merge(2.0),
-        Split(1.0, min_distance=0.1, min_share=0.0),
-        KMeans(2),
-    ]
+    regrouping = [Merge(2.0), Split(1.0, min_distance=0.1, min_share=0.0), KMeans(2)]
+    moves = [Resample(), Propagate(), *regrouping]
     return Filter(model, moves, num_particles, 3, initial_moves=[KMeans(2, reseed=True)])
 
 
