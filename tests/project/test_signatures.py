@@ -35,7 +35,6 @@ DIFFERENT = {
     "frames_per_second",  # of a tracker None asks; a video that is written must have one
     "min_distance",  # of poses None leaves none out; of components that are split, zero
     "num_iterations",  # of Newton, of K-means from seeds, and within one component
-    "num_moves",  # of states at each step; of parameters, which must cross their posterior
     "num_seeds",  # of a gradient, of a matrix of derivatives
     "reassembly",  # the paper's of its filter; the unbiased one of a move
     "regroup_every",  # a Gaussian of two modes loses both, a component of particles does not
