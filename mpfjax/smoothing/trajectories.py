@@ -198,9 +198,10 @@ def sample_trajectories(
         inputs = steps_of_inputs(inputs, length, model, "mixtures")
         inputs = jax.tree.map(lambda leaf: leaf[1:], inputs)
     if is_marginalised(model) or observations is not None:
-        observations = rows_of(observations)
-        present = present_steps(observations, series, refusal_of(model))
-        observations = with_gaps(observations, present)
+        if observations is not None:
+            observations = rows_of(observations)
+            present = present_steps(observations, series, refusal_of(model))
+            observations = with_gaps(observations, present)
         check_marginalised(model, stacked, observations, method)
         paths, indices = sample_marginalised(
             key, model, stacked, observations, inputs, num_trajectories

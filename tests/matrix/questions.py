@@ -229,12 +229,15 @@ def score_with(change):
     return ask
 
 
-def smoothed(row, data, smooth):
-    """Ẑ/Z times the smoothed means of x_1, ..., x_t, and of x_0 where they are there."""
-    answer = row.case(data).answer
+def smoothed(row, data, smooth, is_average=False):
+    """Ẑ/Z times the smoothed means of x_1, ..., x_t, and of x_0 where they are there.
+
+    Or times the average of x_1, ..., x_t over time.
+    """
+    means = row.case(data).answer.smoothed
     increments, found = jax.jit(jax.vmap(smooth))(KEYS[:300])
     ratios, found = row.ratios(data, increments), np.asarray(found, float)
-    expected = answer.smoothed[-found.shape[1] :]
+    expected = means[-len(Y) :].mean(keepdims=True) if is_average else means[-found.shape[1] :]
     unit = unit_of(row.case(data))
     gaps = ratios[:, None] * (found - expected[None]) / unit
     assert_unbiased(gaps, 0.0, loosest=0.1, slack=SLACK.get(data, LEAST))
@@ -270,11 +273,11 @@ def sums(**options):
 
         def smooth(key):
             found = smoothing.smoothed_sums(
-                key, filter, case.series, lambda before, now: value(now), lag=len(Y), **options
+                key, filter, case.series, lambda before, now: value(now), **options
             )
-            return found.run.log_likelihood_increments, found.terms
+            return found.run.log_likelihood_increments, found.sums[-1:] / len(Y)
 
-        smoothed(row, data, smooth)
+        smoothed(row, data, smooth, is_average=True)
 
     return ask
 
