@@ -156,7 +156,8 @@ class Sampling:
             keys = jax.random.split(again, self.num_chains)
             walk = random_walk(self.deviations, reals)
             new, now_fine, none = _start_all(kernel, keys, reals, walk)
-            states = jax.vmap(chosen)(fine, states, new.states) if attempt else new.states
+            fixed = jnp.asarray(fine)
+            states = jax.vmap(chosen)(fixed, states, new.states) if attempt else new.states
             fine |= np.asarray(now_fine)
             if fine.all():
                 walk = random_walk(self.deviations, states.reals)
