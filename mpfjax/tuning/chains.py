@@ -156,9 +156,11 @@ class Sampling:
             keys = jax.random.split(again, self.num_chains)
             walk = random_walk(self.deviations, reals)
             new, now_fine, none = _start_all(kernel, keys, reals, walk)
-            fixed = jnp.asarray(fine)
-            states = jax.vmap(chosen)(fixed, states, new.states) if attempt else new.states
-            fine |= np.asarray(now_fine)
+            if attempt:
+                states = jax.vmap(chosen)(jnp.asarray(fine), states, new.states)
+            else:
+                states = new.states
+            fine = fine | np.asarray(now_fine)
             if fine.all():
                 walk = random_walk(self.deviations, states.reals)
                 return Chains(states, walk, new.num_invalid), jax.tree.map(np.asarray, none)
