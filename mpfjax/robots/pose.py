@@ -12,7 +12,7 @@ from mpfjax.checks import Positive, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.random import split
-from mpfjax.robots.motion import wrap
+from mpfjax.robots.localisation import wrap
 
 _MOST_ODDS = 10.0  # in logarithms: twice the alarm's, so that doubt ends as soon as it may
 _LEAST_WEIGHT = 1e-3  # of a hypothesis that is reported

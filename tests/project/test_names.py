@@ -39,7 +39,7 @@ ALLOWED_FUNCTIONS = {
     "mixture.py": {"occupied"},
     "models/dynamics.py": {"remembered"},
     "robots/maps.py": {"tabulated"},
-    "robots/motion.py": {"interpolated_poses"},
+    "robots/localisation.py": {"interpolated_poses"},
     "robots/pose.py": {"localised"},
     "tuning/densities.py": {"adapted", "evaluated"},
     "tuning/mcmc.py": {"changed"},

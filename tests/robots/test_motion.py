@@ -29,15 +29,3 @@ def test_poses_at_the_times_of_scans():
     halfway = 3.1 + (2 * np.pi - 6.2) / 2
     assert between[0] == pytest.approx([0.5, 1.0, halfway - 2 * np.pi])
     assert between[1:] == pytest.approx(np.array([[1, 2, -3.1], [1, 3.5, -3.025]]))
-    with pytest.raises(ValueError, match="times: "):
-        robots.interpolated_poses([3.5], [0.0, 1.0, 3.0], poses)
-    with pytest.raises(ValueError, match="pose_times: "):
-        robots.interpolated_poses([0.5], [0.0, 1.0, 1.0], poses)
-
-
-def test_refusals():
-    poses = np.array([[0, 0, 170.0], [1, 0, 180.0], [2, 0, 190.0]])
-    with pytest.raises(ValueError, match=r"poses: .*radians"):
-        robots.odometry_steps(poses)
-    with pytest.raises(ValueError, match="min_distance, min_turn"):
-        robots.odometry_steps(0.01 * poses, 0.25)
