@@ -9,12 +9,15 @@ import mpfjax
 from mpfjax import Series
 from mpfjax.models.series import as_series
 from tests import switching
-from tests.together.test_inputs import INPUTS, OBSERVATIONS, Driven, mean
+from tests.together.test_inputs import FILTER, INPUTS, OBSERVATIONS
 from tests.user_models import ScalarLinear, TwoSensors
 
 HOLED = OBSERVATIONS.at[1].set(jnp.nan)
-FILTER = mpfjax.particle_filter(Driven(), 20)
 KEY = jax.random.key(0)
+
+
+def mean(mixture):
+    return mixture.mean()
 
 
 @pytest.mark.parametrize(
