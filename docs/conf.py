@@ -26,11 +26,11 @@ nitpick_ignore_regex = [
     # What public classes hold or pass on, and users neither make nor read.
     ("py:class", r"mpfjax\..*\._\w+"),
     ("py:class", r"mpfjax\.tuning\.(chains|problem|densities)\.\w+"),
-    ("py:class", r"mpfjax\.(moves\.conditional|running\.(late|long_runs))\.\w+"),
+    ("py:class", r"mpfjax\.(moves\.conditional|running\.long_runs)\.\w+"),
     ("py:class", r"mpfjax\.moves\.resampling\.(line|ancestors)\.\w+"),
     ("py:class", r"mpfjax\.vision\.colour\.\w+"),
-    ("py:class", r"mpfjax\.vision\.tracking\.(camera|clutter|gaussian|lives)\.\w+"),
-    ("py:class", r"mpfjax\.vision\.tracking\.(kinds|noise|scores|vectors)\.\w+"),
+    ("py:class", r"mpfjax\.vision\.tracking\.(associate|camera|gaussian|lives)\.\w+"),
+    ("py:class", r"mpfjax\.vision\.tracking\.(detections\.Kind|noise\.\w+|scores\.\w+)"),
     ("py:class", r"mpfjax\.(mixture\.Within|models\.law\.Law)"),
 ]
 
