@@ -134,7 +134,7 @@ class _Sampler(NamedTuple):
 
         def draw(words: UInt32[Array, "2"], state: PyTree) -> PyTree:
             alone = jax.tree.map(lambda leaf: leaf[None], state)
-            drawn = law.draw(jax.random.wrap_key_data(words), alone)
+            drawn = law.draw(jax.random.wrap_key_data(words, impl="threefry2x32"), alone)
             return jax.tree.map(lambda leaf: leaf[0], drawn)
 
         states = jax.vmap(draw)(paths.keys[:, s], paths.states)

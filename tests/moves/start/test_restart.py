@@ -255,3 +255,10 @@ def test_the_evidence_is_that_of_the_prior_beside_the_increment():
     deviation = np.sqrt(MODEL.a**2 * MODEL.p**2 + MODEL.q**2 + MODEL.r**2)
     exact = scipy.stats.norm.logpdf(SCALARS, MODEL.a * MODEL.m, deviation)
     np.testing.assert_allclose(found, exact, atol=0.1)
+
+
+@pytest.mark.exactness
+def test_keys_of_another_generator_start_a_filter():
+    with jax.default_prng_impl("rbg"):
+        run = mpfjax.run_filter(jax.random.key(0), START, SEEN[:LENGTH], mean)
+    assert np.isfinite(run.log_marginal_likelihood)
