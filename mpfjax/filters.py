@@ -69,18 +69,20 @@ def auxiliary_particle_filter(
     model: AbstractStateSpaceModel,
     num_particles: Count,
     lookahead: Lookahead,
+    *,
+    proposal: AbstractProposal | None = None,
 ) -> Filter:
     """The auxiliary particle filter: resample by w times a look-ahead to y_t, propagate.
 
     Pitt and Shephard (1999). `lookahead` is a function (y_t, states) -> log ν of each particle, or
-    a proposal with `log_normaliser`, which then also draws x_t. Ẑ is unbiased for any look-ahead;
-    see `AuxiliaryResample`. With `GaussNewtonProposal(1, inflation=1.0)` for a
-    `LinearGaussianModel` the filter is fully adapted: ν is p(y_t | x_{t-1}), x_t is drawn from
-    p(x_t | x_{t-1}, y_t), and all weights are equal. Use it if the likelihood is narrow and y_t
-    determines early which particles will survive. The filter is `with_lookahead` applied to a
-    `particle_filter`, and can be applied to any other filter in the same way.
+    a proposal with `log_normaliser`, which then also draws x_t unless another `proposal` is given.
+    Ẑ is unbiased for any look-ahead; see `AuxiliaryResample`. With `GaussNewtonProposal(1,
+    inflation=1.0)` for a `LinearGaussianModel` the filter is fully adapted: ν is p(y_t | x_{t-1}),
+    x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are equal. Use it if the likelihood is
+    narrow and y_t determines early which particles will survive. The filter is `with_lookahead`
+    applied to a `particle_filter`, and can be applied to any other filter in the same way.
     """
-    return with_lookahead(particle_filter(model, num_particles), lookahead)
+    return with_lookahead(particle_filter(model, num_particles, proposal=proposal), lookahead)
 
 
 @checked
@@ -90,6 +92,8 @@ def mixture_particle_filter(
     max_components: Count,
     *,
     proposal: AbstractProposal | None = None,
+    scheme: Scheme = "systematic",
+    ess_threshold: Share = 1.0,
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
     regroup: Sequence[AbstractMove] | None = None,
@@ -120,10 +124,11 @@ def mixture_particle_filter(
       proposal or a conditionally linear model.
     - `gradient`: "stop" is `with_score_gradient`.
 
-    `with_resampling` changes the scheme, and the sample size below which a component is resampled.
     Use it if the posterior has several modes that must all be retained.
     """
-    plain = particle_filter(model, num_particles, proposal=proposal)
+    plain = particle_filter(
+        model, num_particles, proposal=proposal, scheme=scheme, ess_threshold=ess_threshold
+    )
     options = _grouping_options(model, features, scale)
     filter = _mixture(plain, max_components, options, _WARM_ITERATIONS, regroup, regroup_every)
     if max_components > 1:
@@ -275,6 +280,7 @@ def bernoulli_filter(
     num_particles: Count,
     max_targets: Count,
     *,
+    proposal: AbstractProposal | None = None,
     particles_per_birth: Count = 50,
     undetected_particles: Count = 400,
     resample: AbstractResampling | None = None,
@@ -301,7 +307,7 @@ def bernoulli_filter(
         undetected_particles=undetected_particles,
         resample=resample,
     )
-    return Filter(model, [Predict(), associate], num_particles, max_targets + 1)
+    return Filter(model, [Predict(proposal), associate], num_particles, max_targets + 1)
 
 
 def _grouping_options(
