@@ -5,7 +5,7 @@ If the weights of the islands have become uneven, `IslandInteraction` redistribu
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Key, PyTree
 from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.series import as_series
+from mpfjax.models.series import as_series, series_of
 from mpfjax.moves.base import AbstractMove, Step, is_missing
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.islands import (
@@ -40,6 +40,8 @@ def run_islands(
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
     num_islands: Count,
+    inputs: PyTree = None,
+    missing: Literal["error", "skip"] = "error",
 ) -> FilterRun:
     """Run one filter of G islands, each a copy of `filter`, on many devices.
 
@@ -50,7 +52,7 @@ def run_islands(
     through the mixture weights"; Vergé et al. 2015 for islands). If the filter's marginal
     likelihood is unbiased, so is the result.
 
-    - `observations`: arrays, or a `Series`, as for `run_filter`.
+    - `observations`, `inputs`, `missing`: as for `run_filter`.
     - `filter`: the filter of one island, with its N and M. A standard particle filter makes islands
       of particles. With an `IslandInteraction` among the moves, their weights stay even.
     - `num_islands`: G. The largest number of devices that divides G shares them. The result depends
@@ -66,7 +68,7 @@ def run_islands(
     Use it if one filter is too large or too slow for one device. For many runs of a filter that
     fits on one device, use `monte_carlo`.
     """
-    series = as_series(observations, filter.model)
+    series = as_series(series_of(observations, inputs, missing), filter.model)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
 
     def run(filter: Filter) -> FilterRun:
