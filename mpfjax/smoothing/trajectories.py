@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import Count, checked, warn
+from mpfjax.checks import Count, CountOrZero, checked, warn
 from mpfjax.filter import Filter
 from mpfjax.memory import check_past
 from mpfjax.mixture import MarginalisedState, ParticleMixture
@@ -148,6 +148,7 @@ def sample_trajectories(
     mixtures: FilterRun | ParticleMixture,
     num_trajectories: Count,
     *,
+    component: CountOrZero | None = None,
     method: Literal["exact", "mcmc"] = "exact",
     inputs: PyTree = None,
     observations: PyTree = None,
@@ -163,6 +164,7 @@ def sample_trajectories(
     - `mixtures`: a run of `run_filter(..., collect=None)`, or the mixtures that it collected.
     - `num_trajectories`: k. Leaves of the result are (k, t + 1, ...); (k, t, ...), without x_0, for
       mixtures alone.
+    - `component`: draw x_t from this component of the last mixture only: the past of one mode.
     - `method`: "exact" weights all N particles, O(N) per trajectory and step. "mcmc" (Dau and
       Chopin 2023) starts at the ancestor of x_{s+1} and makes a step of independent
       Metropolis-Hastings, with a proposal by W_s: O(1) per trajectory and step. It becomes as
@@ -174,13 +176,13 @@ def sample_trajectories(
       `MarginalisedState` of them with the mean and the covariance of each x_s given these and
       y_1..y_t. It requires a whole run, with x_0, and method "exact".
 
-    Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a run with
-    restarts, and for "mcmc" if particles have no single ancestors (an index below 0); a
-    RuntimeError if no particle can have moved to the next. Within a caller's jit, states are NaN in
-    place of these errors. If the backward weights degenerate, so that at some time fewer than a
-    tenth of the trajectories are distinct, a RuntimeWarning reports the fraction. Use it for
-    estimates of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but
-    has few distinct states at early times.
+    Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
+    that does not exist or is empty, a run with restarts, and for "mcmc" if particles have no single
+    ancestors (an index below 0); a RuntimeError if no particle can have moved to the next. Within
+    a caller's jit, states are NaN in place of these errors. If the backward weights degenerate, so
+    that at some time fewer than a tenth of the trajectories are distinct, a RuntimeWarning reports
+    the fraction. Use it for estimates of the past. The genealogy of the particles
+    (`trace_ancestors`) is exact as well, but has few distinct states at early times.
     """
     model = filter.model if isinstance(filter, Filter) else filter
     if not isinstance(filter, Filter):
@@ -197,6 +199,8 @@ def sample_trajectories(
     else:
         inputs = steps_of_inputs(inputs, length, model, "mixtures")
         inputs = jax.tree.map(lambda leaf: leaf[1:], inputs)
+    if component is not None:
+        stacked = _ending_in(component, stacked)
     if is_marginalised(model) or observations is not None:
         if observations is not None:
             observations = rows_of(observations)
@@ -213,6 +217,18 @@ def sample_trajectories(
     check_pasts(indices)
     _warn_of_few(indices, stacked)
     return paths
+
+
+def _ending_in(component: int, mixtures: ParticleMixture) -> ParticleMixture:
+    """The mixtures, whose last one has no weight outside one component."""
+    active = jax.tree.map(lambda leaf: leaf[-1], mixtures).active
+    alive = range(component + 1) if isinstance(active, Tracer) else np.flatnonzero(active).tolist()
+    if component not in alive:
+        raise ValueError(f"component: {component} is empty at the last step; active are {[*alive]}")
+    is_member = mixtures.component_indicators[-1] == component
+    last = jnp.where(is_member, mixtures.log_weights[-1], -jnp.inf)
+    log_weights = mixtures.log_weights.at[-1].set(last)
+    return eqx.tree_at(lambda mixtures: mixtures.log_weights, mixtures, log_weights)
 
 
 @jit_on_wide_vectors

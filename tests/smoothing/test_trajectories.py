@@ -1,4 +1,4 @@
-"""Trajectories of mixtures alone, genealogies, and warnings where backward sampling degenerates."""
+"""Trajectories of a component, of mixtures alone, genealogies, and warnings of few paths."""
 
 import warnings
 
@@ -14,6 +14,21 @@ from mpfjax.smoothing import backward, sample_trajectories, trace_ancestors
 
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
 SQUARES = np.array([1.2, 0.8, 1.5, 1.0], np.float32)
+
+
+@pytest.mark.exactness
+def test_trajectories_of_one_component_stay_with_its_mode():
+    """With little noise the modes are apart from the second step on, and nobody changes sides."""
+    sharp = mpfjax.QuadraticModel(0.1, 0.1, -2.0, 2.0)
+    filter = mpfjax.mixture_particle_filter(sharp, 100, 2)
+    run = mpfjax.run_filter(jax.random.key(1), filter, jnp.full(6, 1.5))
+    means = np.asarray(run.final.component_means())
+    assert np.sign(means).sum() == 0
+    for m in range(2):
+        drawn = sample_trajectories(jax.random.key(m), filter, run, 50, component=m)
+        assert (np.sign(drawn[:, -1]) == np.sign(means[m])).mean() > 0.9
+    with pytest.raises(ValueError, match=r"component: 2 is empty at the last step"):
+        sample_trajectories(jax.random.key(0), filter, run, 50, component=2)
 
 
 @pytest.mark.exactness
