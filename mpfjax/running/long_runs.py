@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Mapping
-from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,14 +21,9 @@ from mpfjax.running.storage import (
     write_described,
 )
 
-_CHECKPOINTS: ContextVar[tuple["Checkpoint", ...]] = ContextVar("checkpoints", default=())
-
 
 class Checkpoint(Checked):
     """The file from which a long run continues: `fit`, `maximise`, and the samplers of parameters.
-
-        with mpfjax.Checkpoint("fit.npz"):
-            run = fit(...)
 
     - `path`: a .npz file, without pickles. If it exists, the same call continues from it, with the
       result of an uninterrupted run, to the bit. The call may ask for more steps or observations.
@@ -44,13 +38,6 @@ class Checkpoint(Checked):
 
     path: str | os.PathLike[str]
     every: Count = 50
-
-    def __enter__(self) -> "Checkpoint":
-        _CHECKPOINTS.set((*_CHECKPOINTS.get(), self))
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        _CHECKPOINTS.set(_CHECKPOINTS.get()[:-1])
 
 
 class State(NamedTuple):
@@ -71,7 +58,7 @@ class Broken(Exception):
 
 @dataclass(frozen=True)
 class LongRun:
-    """A run of the public function `caller`, up to a last step, with the innermost `Checkpoint`.
+    """A run of the public function `caller`, up to a last step.
 
     `settings` are all numbers, arrays, modules and names that have to be the same for a file to be
     of this run, up to a step. The code of functions is not compared.
@@ -79,6 +66,7 @@ class LongRun:
 
     caller: str
     last: int
+    checkpoint: Checkpoint | None
     progress: bool
     settings: Callable[[int], Mapping[str, Any]]
 
@@ -90,7 +78,7 @@ class LongRun:
         raised, and what is broken at the start is a RuntimeError.
         """
         state = start if start.step else self._load(start) or start
-        every = self.last if self._checkpoint is None else self._checkpoint.every
+        every = self.last if self.checkpoint is None else self.checkpoint.every
         pieces, last_save, stopped = [state.rows], state.step, None
         bar = tqdm(total=self.last, initial=state.step, disable=not self.progress, unit="step")
         try:
@@ -117,10 +105,6 @@ class LongRun:
             warn(f"{self.caller}: {stopped}; its result is of the steps before", UserWarning)
         return state._replace(rows=_concatenate(pieces)), stopped
 
-    @property
-    def _checkpoint(self) -> Checkpoint | None:
-        return next(reversed(_CHECKPOINTS.get()), None)
-
     def _identity(self, step: int) -> dict[str, str]:
         """What the file of this run holds of it, up to a step, as text."""
         return {"caller": self.caller} | describe_parts(**self.settings(step))
@@ -128,17 +112,17 @@ class LongRun:
     def _save(self, state: State, pieces: list[PyTree]) -> PyTree:
         """All rows in one piece, written to the file with the state."""
         rows = _concatenate(pieces)
-        if self._checkpoint is not None:
+        if self.checkpoint is not None:
             arrays = arrays_of({"carry": state.carry, "rows": rows})
             notes = {"step": state.step, "identity": self._identity(state.step)}
-            write_described(self._checkpoint.path, arrays, notes)
+            write_described(self.checkpoint.path, arrays, notes)
         return rows
 
     def _load(self, like: State) -> State | None:
         """The state that the file holds, None without a file; a `ValueError` for another run's."""
-        if self._checkpoint is None or not Path(self._checkpoint.path).exists():
+        if self.checkpoint is None or not Path(self.checkpoint.path).exists():
             return None
-        path = self._checkpoint.path
+        path = self.checkpoint.path
         arrays, notes = read_described(path)
         step, other = notes.get("step", 0), notes.get("identity", {})
         identity = self._identity(step)

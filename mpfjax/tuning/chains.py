@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count, CountOrZero, warn
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.running.long_runs import LongRun, State
+from mpfjax.running.long_runs import Checkpoint, LongRun, State
 from mpfjax.tuning.densities import RandomWalk, SamplePrior, chosen, drawn, random_walk
 from mpfjax.tuning.problem import Problem, Reals
 from mpfjax.tuning.summaries import (
@@ -118,6 +118,7 @@ class Sampling:
     num_chains: Count
     sample_prior: SamplePrior | None
     burn_in: CountOrZero
+    checkpoint: Checkpoint | None
     progress: bool
 
     def run(self, kernel: AbstractKernel) -> tuple[list[PyTree], dict[str, Any]]:
@@ -127,7 +128,7 @@ class Sampling:
             "key": self.key, "burn_in": self.burn_in, "num_chains": self.num_chains,
         }  # fmt: skip
         last = self.burn_in + self.num_steps
-        run = LongRun(self.caller, last, self.progress, lambda step: settings)
+        run = LongRun(self.caller, last, self.checkpoint, self.progress, lambda step: settings)
         key_starts, key_steps = jax.random.split(self.key)
         chains, none = self._start_chains(kernel, key_starts)
         state, stopped = run.go(State(0, chains, none), self._advance(kernel, key_steps))

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.checks import Count, CountOrZero, checked
 from mpfjax.filter import Filter
 from mpfjax.models.base import require
+from mpfjax.running.long_runs import Checkpoint
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.conditional import check_conditional, possible_times, renew
 from mpfjax.smoothing.trajectories import draw_trajectory
@@ -61,6 +62,7 @@ def metropolis_hastings(
     num_chains: Count = 1,
     sample_prior: SamplePrior | None = None,
     burn_in: CountOrZero = 0,
+    checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> Posterior:
     """Sample p(θ | y_1..y_t) with the filter's estimate Ẑ(θ) instead of the likelihood.
@@ -93,6 +95,8 @@ def metropolis_hastings(
     - `burn_in`: steps before the others, none of which is stored; 0 by default. In them the random
       walk adapts to the posterior's covariance, estimated from all chains (Haario, Saksman and
       Tamminen 2001). Then it no longer changes, and the chains are Markov chains.
+    - `checkpoint`: a `Checkpoint`, from whose file the same call continues, also to a larger
+      `num_steps`.
 
     A proposal with a prior or likelihood that is NaN or +inf is rejected, and counted in
     `num_invalid`, with a warning. Ctrl-C returns the draws so far with a warning, if there are any.
@@ -108,7 +112,7 @@ def metropolis_hastings(
     deviations = checked_deviations(proposal_deviations, problem.start())
     sampling = Sampling(
         "metropolis_hastings", key, problem, deviations, num_steps, num_chains, sample_prior,
-        burn_in, progress,
+        burn_in, checkpoint, progress,
     )  # fmt: skip
     density = LogDensity(problem, checked_prior(log_prior, problem, key, sample_prior))
     (values, accepted, key_data), fields = sampling.run(_MetropolisHastings(density))
@@ -168,6 +172,7 @@ def particle_gibbs(
     num_chains: Count = 1,
     sample_prior: SamplePrior | None = None,
     burn_in: CountOrZero = 0,
+    checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> GibbsPosterior:
     """Sample p(θ, x_0, ..., x_t | y_1..y_t), parameters and trajectory in turn.
@@ -186,10 +191,10 @@ def particle_gibbs(
       there are five steps for each new trajectory.
     - `observations`: one sequence, arrays or a `Series`. `parameters`, `transforms`: as for `fit`.
       Parameters are usually the model's; parameters of a proposal have no posterior.
-    - `num_chains`, `sample_prior`, `burn_in`: as for `metropolis_hastings`. Each chain starts at a
-      separate trajectory. During the burn-in the random walk also adapts its scale, because the
-      density given a trajectory has no noise: it aims at accepting 44% of the Metropolis steps for
-      one coordinate, 23% for several.
+    - `num_chains`, `sample_prior`, `burn_in`, `checkpoint`: as for `metropolis_hastings`. A chain
+      starts at a trajectory of its own. During the burn-in the random walk also adapts its scale,
+      because the density given a trajectory has no noise: it aims at accepting 44% of the
+      Metropolis steps for one coordinate, 23% for several.
 
     A proposal whose density is NaN or +inf is rejected. If the conditional filter meets such a
     density, the whole step is rejected. `num_invalid` counts both, with a warning. Ctrl-C returns
@@ -210,7 +215,7 @@ def particle_gibbs(
     deviations = checked_deviations(proposal_deviations, problem.start())
     sampling = Sampling(
         "particle_gibbs", key, problem, deviations, num_steps, num_chains, sample_prior, burn_in,
-        progress,
+        checkpoint, progress,
     )  # fmt: skip
     kernel = _Gibbs(problem, checked_prior(log_prior, problem, key, sample_prior))
     (paths, accepted, renewed), fields = sampling.run(kernel)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, Rule, checked, shown, warn
 from mpfjax.filter import Filter
-from mpfjax.running.long_runs import Broken, LongRun, State
+from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State
 from mpfjax.tuning.evidence import Score, names_but_proposals, pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import (
     Objective,
@@ -74,6 +74,7 @@ def fit(
     batch: Count | None = None,
     pooled: bool | None = None,
     score: Score = "filter",
+    checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> TuningRun:
     """Maximise the log marginal likelihood over some of a filter's parameters.
@@ -113,6 +114,8 @@ def fit(
       needs no derivative of draws or moves. The model needs `log_transition` and `log_initial` and
       may not be conditionally linear, the parameters must be the model's, and every move must leave
       each particle one parent.
+    - `checkpoint`: a `Checkpoint`, from whose file the same call continues, also to a larger
+      `num_steps`.
 
     A warning is issued if fewer than two seeds count (`effective_seeds`), because log Ẑ varies
     strongly from seed to seed: the bias is then about that of one seed.
@@ -132,7 +135,7 @@ def fit(
         "fit", "log marginal likelihood", key, problem, optimizer, num_seeds, batch, pooled
     )
     data = {"observations": problem.objective, "score": score}
-    values, run = ascent.climb(num_steps, progress, data)
+    values, run = ascent.climb(num_steps, checkpoint, progress, data)
     if values is None:
         return run
     if pooled:
@@ -167,28 +170,30 @@ def maximise(
     *,
     parameters: Parameters = None,
     transforms: Transforms = None,
+    num_seeds: Count = 1,
+    checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> TuningRun:
     """Maximise any objective over some of a model's, or a filter's, parameters.
 
-    Maximises `objective(key, model)`, a scalar that JAX can differentiate, with a new key in each
-    step, as `fit` does for the log marginal likelihood, with the same arguments, checks and report.
-    Use it for another objective, such as that of an unnormalised likelihood on labelled frames.
+    Maximises the mean over seeds of `objective(key, model)`, a scalar that JAX can differentiate,
+    as `fit` does for the log marginal likelihood, with the same arguments, checks and report. Use
+    it for another objective, such as that of an unnormalised likelihood on labelled frames.
 
     - `model`: the pytree that is the argument of the objective.
     - `objective`: a function, or an `equinox.Module` with a `__call__`, whose arrays are the data.
-      A deterministic objective ignores its key.
+      A deterministic objective ignores its key, and needs one seed.
     - `parameters`: as for `fit`, selected from `model`; None is every floating-point array of it.
 
     Raises errors as `fit` does for the same arguments, and `ValueError` for an objective that is
     not a floating-point scalar.
     """
     problem = pose(model, objective, parameters, transforms)
-    ascent = _Ascent("maximise", "value", key, problem, optimizer)
+    ascent = _Ascent("maximise", "value", key, problem, optimizer, num_seeds)
     value = eqx.filter_eval_shape(objective, key, problem.at(problem.start()))
     if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(f"objective: it returns {shown(value)}, no floating point scalar")
-    _, run = ascent.climb(num_steps, progress, {"objective": objective})
+    _, run = ascent.climb(num_steps, checkpoint, progress, {"objective": objective})
     del run.history["effective_seeds"]  # of values that are no logarithms of likelihoods
     return run
 
@@ -202,12 +207,12 @@ class _Ascent:
     key: Key[Array, ""]
     problem: Problem
     optimizer: optax.GradientTransformation
-    num_seeds: int = 1
+    num_seeds: int
     batch: int | None = None  # of the series in a step, where the objective is a `LogEvidence`
     pooled: bool = False
 
     def climb(
-        self, num_steps: int, progress: bool, data: dict[str, Any]
+        self, num_steps: int, checkpoint: Checkpoint | None, progress: bool, data: dict[str, Any]
     ) -> tuple[Float[np.ndarray, "seeds series"] | None, TuningRun]:
         """The objective at the end, None where it is not finite, and the result."""
         reals = self.problem.start()
@@ -216,7 +221,7 @@ class _Ascent:
         start = State(0, (reals, optimizer), (np.empty(0), np.empty(0), np.empty(0), no_path))
         settings = {"key": self.key, "num_seeds": int(self.num_seeds)}
         settings |= {"batch": self.batch, "pooled": self.pooled} | self.problem.settings | data
-        run = LongRun(self.caller, num_steps, progress, lambda step: settings)
+        run = LongRun(self.caller, num_steps, checkpoint, progress, lambda step: settings)
         state, stopped = run.go(start, self._advance)
         (reals, _), (averages, deviations, effective, path) = state.carry, state.rows
         key = jax.random.fold_in(self.key, state.step)

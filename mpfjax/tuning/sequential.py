@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import Count, checked, kinds
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.series import Series
-from mpfjax.running.long_runs import Broken, LongRun, State
+from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State
 from mpfjax.tuning.chains import warn_of_invalid
 from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn
 from mpfjax.tuning.evidence import UnbiasedFilter, one_sequence, pose_evidence, with_present
@@ -152,6 +152,7 @@ def smc2(
     num_moves: Count = 5,
     parameters: Parameters = None,
     transforms: Transforms = None,
+    checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> SequentialPosterior:
     """Sample p(θ | y_1..y_s) for s = 1, ..., t: particles of θ, each with its own filter.
@@ -172,6 +173,8 @@ def smc2(
       are resampled, and all states of their chains are retained (waste-free, Dau and Chopin 2022),
       which takes less time for the same number of samples than retaining only the ends of the
       chains.
+    - `checkpoint`: a `Checkpoint`, from whose file the samples continue, also to more observations
+      than so far. Everything else must be the same.
     - `observations`: one sequence, arrays or a `Series`; `SequentialPosterior.extend` processes
       later ones. `parameters`, `transforms`: as for `fit`.
 
@@ -202,7 +205,7 @@ def smc2(
     settings = problem.settings | {
         "key": key, "num_samples": int(num_samples), "num_moves": int(num_moves),
     }  # fmt: skip
-    run = _Run(sampler, series, key_steps, progress, settings)
+    run = _Run(sampler, series, key_steps, checkpoint, progress, settings)
     samples = start(jax.random.split(key_filters, num_samples), sampler, reals)
     rows = np.empty(0), np.empty(0), np.empty(0)
     return run.posterior(State(0, (samples, np.arange(num_samples), 0), rows))
@@ -220,6 +223,7 @@ class _Run:
     series: Series
     """the data of the filters, in arrays of numpy."""
     key: Key[Array, ""]
+    checkpoint: Checkpoint | None
     progress: bool
     settings: dict[str, Any]
     """all that has to be the same for a file to fit, beside the observations."""
@@ -251,7 +255,7 @@ class _Run:
             before = jax.tree.map(lambda leaf: leaf[:step], self.series)
             return self.settings | {"observations": with_present(before)}
 
-        run = LongRun("smc2", self.series.length, self.progress, settings)
+        run = LongRun("smc2", self.series.length, self.checkpoint, self.progress, settings)
         state, stopped = run.go(start, self._advance)
         samples, _, num_invalid = state.carry
         warn_of_invalid("smc2", num_invalid - start.carry[-1])

@@ -192,8 +192,9 @@ class TestLongRuns:
 
     def go(self, path, last, stop=None, error=None, every=3, **settings):
         """The rows and what stopped it; `error` comes where a step beyond `stop` is asked for."""
-        run = LongRun("adding", last, False, lambda step: {"start": 0} | settings)
-
+        checkpoint = None if path is None else Checkpoint(path, every)
+        settings = {"start": 0} | settings
+        run = LongRun("adding", last, checkpoint, False, lambda step: settings)
         start = State(0, np.array(0), np.zeros(0, int))
 
         def advance(step, last, total):
@@ -201,8 +202,7 @@ class TestLongRuns:
                 raise error
             return step + 1, total + step + 1, total[None] + step + 1
 
-        with contextlib.nullcontext() if path is None else Checkpoint(path, every):
-            state, stopped = run.go(start, advance)
+        state, stopped = run.go(start, advance)
         assert state.step == len(state.rows)
         return state.rows.tolist(), stopped
 

@@ -114,25 +114,25 @@ def assert_same_draws(one, other):
 def test_interrupted_anywhere_the_draws_are_those_of_one_run(tmp_path, monkeypatch):
     """In the burn-in, where nothing is lost, and after it, where the draws so far come back."""
     whole, file = blind(15, **WHOLE), Checkpoint(tmp_path / "chains.npz", 4)
-    with monkeypatch.context() as patch, file:
+    with monkeypatch.context() as patch:
         interrupt_after(patch, 5)
         with pytest.raises(KeyboardInterrupt):
-            blind(15, **WHOLE)
-    with monkeypatch.context() as patch, file:
+            blind(15, checkpoint=file, **WHOLE)
+    with monkeypatch.context() as patch:
         interrupt_after(patch, 14)
         with pytest.warns(UserWarning, match=r"interrupted at step \d+ of 24"):
-            part = blind(15, **WHOLE)
+            part = blind(15, checkpoint=file, **WHOLE)
     draws = part.parameters["a"].shape[1]
     assert 0 < draws < 15
     assert "interrupted" in part.stopped
     np.testing.assert_array_equal(part.parameters["a"], whole.parameters["a"][:, :draws])
     longer = blind(22, **WHOLE)
-    with file:
-        assert_same_draws(blind(15, **WHOLE), whole)
-        assert_same_draws(blind(22, **WHOLE), longer)
-        with pytest.raises(ValueError, match=r"of another metro.*num_chains is .* and 3 here"):
-            blind(15, num_chains=3, **WHOLE)
-        np.testing.assert_array_equal(blind(15, **WHOLE).parameters["a"], whole.parameters["a"])
+    options = WHOLE | {"checkpoint": file}
+    assert_same_draws(blind(15, **options), whole)
+    assert_same_draws(blind(22, **options), longer)
+    with pytest.raises(ValueError, match=r"of another metro.*num_chains is .* and 3 here"):
+        blind(15, num_chains=3, **options)
+    np.testing.assert_array_equal(blind(15, **options).parameters["a"], whole.parameters["a"])
 
 
 @pytest.mark.exactness

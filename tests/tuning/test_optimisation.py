@@ -1,6 +1,5 @@
 """`fit` finds the maximum, says what is wrong, and goes on where it was interrupted."""
 
-import contextlib
 import warnings
 from functools import cache
 from typing import ClassVar
@@ -51,8 +50,8 @@ def short_fit(num_steps=6, *, parameters=NOISE, optimizer=ADAM, start=None, path
     options = {"num_seeds": 4, "progress": False, "transforms": {"r": Positive()}} | options
     arguments = {"key": jax.random.key(0), "observations": OBSERVATIONS}
     arguments |= {"filter": small(**(start or {})), "optimizer": optimizer, "num_steps": num_steps}
-    with contextlib.nullcontext() if path is None else Checkpoint(path):
-        return fit(**arguments | {"parameters": parameters} | options)
+    checkpoint = None if path is None else Checkpoint(path)
+    return fit(**arguments | {"parameters": parameters, "checkpoint": checkpoint} | options)
 
 
 def series_of(length, rng):
@@ -296,12 +295,13 @@ def falling(step):
 
 
 class TestAnyObjective:
-    def ascent(self, num_steps):
+    def ascent(self, num_steps, noise=0.0, **options):
         def parabola(key, model):
-            return -((model.r - 3.0) ** 2)
+            return noise * jax.random.normal(key) - (model.r - 3.0) ** 2
 
         arguments = jax.random.key(0), ScalarLinear(r=1.0), parabola, optax.sgd(0.1), num_steps
-        return maximise(*arguments, parameters={"r": lambda model: model.r}, progress=False)
+        options |= {"parameters": {"r": lambda model: model.r}, "progress": False}
+        return maximise(*arguments, **options)
 
     def test_a_function_is_an_objective(self):
         run = self.ascent(60)
@@ -310,10 +310,13 @@ class TestAnyObjective:
         assert run.value == pytest.approx(0.0, abs=1e-4)
 
     def test_it_goes_on_from_a_checkpoint(self, tmp_path):
-        whole = self.ascent(6)
-        with Checkpoint(tmp_path / "ascent.npz"):
-            self.ascent(3)
-            assert_same(self.ascent(6), whole)
+        checkpoint = Checkpoint(tmp_path / "ascent.npz")
+        self.ascent(3, checkpoint=checkpoint)
+        assert_same(self.ascent(6, checkpoint=checkpoint), self.ascent(6))
+
+    def test_it_is_averaged_over_seeds(self):
+        run = self.ascent(30, noise=1.0, num_seeds=200)
+        assert np.abs(run.history["deviation"] - 1.0).max() < 0.25  # five standard errors
 
 
 class Plain(ScalarLinear):

@@ -77,10 +77,10 @@ def test_interrupted_and_resumed_the_samples_are_those_of_one_run(tmp_path, monk
     """Also to observations that were not there before."""
     whole, file = sample(), Checkpoint(tmp_path / "samples.npz", every=3)
     assert np.isfinite(whole.acceptance_rates).any()
-    with monkeypatch.context() as patch, file:
+    with monkeypatch.context() as patch:
         interrupt_at(patch, 5)
         with pytest.warns(UserWarning, match="interrupted at step 5 of 8"):
-            some = sample()
+            some = sample(checkpoint=file)
     assert some.stopped == "interrupted at step 5 of 8"
     assert_same_rows(some, whole, 5)
     grown = some.extend(part(5, 6), progress=False)
@@ -88,15 +88,14 @@ def test_interrupted_and_resumed_the_samples_are_those_of_one_run(tmp_path, monk
     assert len(some.log_likelihood_increments) == 5
     with pytest.raises(ValueError, match=r"observations: .* is not like those before"):
         some.extend(jnp.zeros((2, 3)))
-    with Checkpoint(tmp_path / "6.npz"):
-        sample(observations=part(0, 6))
-        assert_same_samples(sample(), whole)
-    with file:
-        assert_same_samples(sample(), whole)
-        with pytest.raises(ValueError, match=r"is of another smc2: observations.* is"):
-            sample(observations=Series.skipping(OBSERVATIONS.at[0].add(1.0)))
-        with pytest.raises(ValueError, match=r"another smc2: num_moves is 5 there and 2 here"):
-            sample(num_moves=2)
+    six = Checkpoint(tmp_path / "6.npz")
+    sample(observations=part(0, 6), checkpoint=six)
+    assert_same_samples(sample(checkpoint=six), whole)
+    assert_same_samples(sample(checkpoint=file), whole)
+    with pytest.raises(ValueError, match=r"is of another smc2: observations.* is"):
+        sample(observations=Series.skipping(OBSERVATIONS.at[0].add(1.0)), checkpoint=file)
+    with pytest.raises(ValueError, match=r"another smc2: num_moves is 5 there and 2 here"):
+        sample(num_moves=2, checkpoint=file)
 
 
 class Fragile(ScalarLinear):
