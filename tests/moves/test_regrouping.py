@@ -308,7 +308,10 @@ def test_objects_are_weighed_down_by_the_others_and_not_by_hypotheses_about_them
         group=lambda states: states[:, 1].astype(np.int32),
     )  # fmt: skip
     moved = eqx.filter_jit(move)(KEY, mixture, mpfjax.Step(MODEL, jnp.float32(0.0)))
-    near = lambda a, b: np.exp(-(((a - b) / 10) ** 2) / (2 * 0.5**2))  # noqa: E731
+
+    def near(a, b):
+        return np.exp(-(((a - b) / 10) ** 2) / (2 * 0.5**2))
+
     of_object_0 = [2 * near(x, 5.0) for x in places[:3]]
     of_object_1 = [2 * (0.8 * near(x, 1.0) + 0.2 * near(x, 50.0)) for x in places[3:]]
     penalty = np.asarray(mixture.log_weights - moved.log_weights)
