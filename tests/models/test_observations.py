@@ -36,6 +36,13 @@ def test_it_is_run_as_the_keywords_are(series):
 
 
 @pytest.mark.exactness
+def test_islands_take_the_keywords_too():
+    run = mpfjax.run_islands(KEY, FILTER, HOLED, mean, num_islands=2, inputs=INPUTS, missing="skip")
+    expected = mpfjax.run_islands(KEY, FILTER, Series.skipping(HOLED, INPUTS), mean, num_islands=2)
+    np.testing.assert_array_equal(run.collected, expected.collected)
+
+
+@pytest.mark.exactness
 def test_within_jit_it_is_the_same():
     def run(series):
         return mpfjax.run_filter(KEY, FILTER, series).log_marginal_likelihood
