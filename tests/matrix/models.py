@@ -103,6 +103,9 @@ class InTree(OfNoise):
     def log_likelihood(self, observation, states):
         return super().log_likelihood(observation, states["x"])
 
+    def sample_observation(self, key, states):
+        return super().sample_observation(key, states["x"])
+
     # Of a state that is one array.
     transition_mean = observation_mean = property()
 
@@ -262,7 +265,7 @@ def linear(law, **options):
 def matrices_by_step(law, u):
     """The inputs of the same."""
     each = {"A": law.a, "Q": law.q**2, "B": law.b}
-    fields = {name: np.full((len(u), 1, 1), value, np.float32) for name, value in each.items()}
+    fields = {name: jnp.full((len(u), 1, 1), value, jnp.float32) for name, value in each.items()}
     return fields | {"inputs": np.asarray(u, np.float32)[:, None]}
 
 

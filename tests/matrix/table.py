@@ -58,9 +58,10 @@ METROPOLIS = these("RandomWalkMetropolis", "Metropolis beside stop")
 OF_NOISE = these("point sets", "look-ahead")
 # What asks for the density of a step.
 OF_DENSITY = these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "score", "Gibbs",
-                   "conditional filter")  # fmt: skip
-OF_STATES = these("trajectories, mcmc", "sums", "sums, mcmc", "conditional filter", "Gibbs")
-OF_PARENTS = these("genealogy", "trajectories, mcmc", "sums, mcmc")
+                   "Fisher", "conditional filter")  # fmt: skip
+OF_STATES = these("trajectories, mcmc", "sums", "sums, mcmc", "conditional filter", "Gibbs",
+                  "Fisher")  # fmt: skip
+OF_PARENTS = these("genealogy", "trajectories, mcmc", "sums, mcmc", "Fisher")
 OF_PATHS = these("conditional filter", "Gibbs")
 UNBIASED = these("Metropolis", "SMC²")
 JOINT = these("independent", "clustered")
@@ -69,7 +70,7 @@ APPROXIMATE = GAUSSIAN | these("distributed", "Bernoulli", "Prune", "Exclusion",
 # Draws of these are not seen by derivatives.
 BEGUN = these("start", "restarts")
 UNSEEN = JOINT | BEGUN | these("two draws", "PropagateNested", "Prune", "Exclusion",
-                       "own function", "initially own function", "Bernoulli")  # fmt: skip
+                       "own function", "initially own function")  # fmt: skip
 RULES = (
     Rule("MultiObjectModel", "filters of several objects are for a `MultiObjectModel`",
          forms=but(FORMS, "one of several"), filters=OF_OBJECTS),
@@ -94,7 +95,8 @@ RULES = (
          "Gaussian filters, `PilotLookahead`, Metropolis moves, PaRIS and conditional SMC do not "
          "support conditionally linear models, whose states are only partly sampled",
          forms=LINEAR, filters=GAUSSIAN | METROPOLIS | these("look-ahead")),
-    Rule("conditionally linear|by 'exact'", "", forms=LINEAR, questions=OF_STATES),
+    Rule("conditionally linear|by 'exact'|no log_transition", "",
+         forms=LINEAR, questions=OF_STATES),
     Rule("floating point", "Gaussian filters do not model whole numbers: exclude them by `where`",
          forms=these("tree", "whole numbers"), filters=GAUSSIAN),
     Rule("which draw is kept|derivatives do not see",
@@ -121,8 +123,9 @@ RULES = (
     Rule("draws in a way", "", filters=these("with families > selected start")),
     Rule("single|one parent|ancestors",
          "genealogies and the method \"mcmc\" of smoothers need single ancestors: no Gaussian "
-         "regeneration, islands or filters of separate objects",
-         filters=GAUSSIAN | JOINT | these("IslandInteraction"), questions=OF_PARENTS),
+         "regeneration and no filters of separate objects",
+         filters=(GAUSSIAN | JOINT | these("Bernoulli")) - these("initially Gaussian"),
+         questions=OF_PARENTS),
     Rule("cannot keep a trajectory|cannot be smoothed|independent|one Propagate|approximate",
          "conditional SMC and particle Gibbs support only `Resample`, `Propagate` and regrouping",
          filters=GAUSSIAN | OF_OBJECTS | METROPOLIS | BEGUN
@@ -130,15 +133,17 @@ RULES = (
                  "PropagateRegimes", "own function", "initially own function", "Prune",
                  "Exclusion"),
          questions=OF_PATHS),
-    Rule("log_initial", "`particle_gibbs` needs a density of x_0, which a `MultiObjectModel` "
-         "has not", forms=these("one of several"), questions=these("Gibbs")),
+    Rule("log_initial", '`particle_gibbs` and `score="fisher"` need a density of x_0, which a '
+         "`MultiObjectModel` has not", forms=these("one of several"),
+         questions=these("Gibbs", "Fisher")),
     Rule("unbiased likelihood",
          "`metropolis_hastings` and `smc2` refuse filters that are `approximate`",
          filters=APPROXIMATE, questions=UNBIASED),
     Rule("cannot be smoothed", "a run with a start cannot be smoothed: its state is drawn anew",
          filters=these("start"),
          questions=these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "genealogy")),
-    Rule("no particle one parent", "", filters=BEGUN, questions=these("sums, mcmc")),
+    Rule("no particle one parent", "",
+         filters=BEGUN | these("IslandInteraction"), questions=these("sums, mcmc", "Fisher")),
     Rule("slots", "filters of separate objects, a start and restarts need every slot",
          filters=JOINT | BEGUN,
          questions=these("slots")),

@@ -18,7 +18,7 @@ from tests.matrix.questions import OF_RUNS, OTHERS, QUESTIONS, Row
 from tests.matrix.table import LINEAR, rules_of
 
 SINGLES = [*RECIPES, *SINGLE, *MOVES]
-OF_PARAMETERS = ("Gibbs", "Metropolis", "SMC²")
+OF_PARAMETERS = ("Fisher", "Gibbs", "Metropolis", "SMC²")
 GAPS = ("complete", "NaN", "present")
 
 
