@@ -144,8 +144,8 @@ RULES = (
          questions=these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "genealogy")),
     Rule("no particle one parent", "",
          filters=BEGUN | these("IslandInteraction"), questions=these("sums, mcmc", "Fisher")),
-    Rule("slots", "filters of separate objects, `bernoulli_filter`, a start and restarts need every "
-         "slot",
+    Rule("slots", "filters of separate objects, `bernoulli_filter`, a start and restarts need "
+         "every slot",
          filters=JOINT | BEGUN | these("Bernoulli"), questions=these("slots")),
     Rule("islands", "`run_islands` does not support `bernoulli_filter`",
          filters=these("Bernoulli"), questions=these("islands")),
