@@ -396,9 +396,10 @@ def fisher(row, data):
         run = tuning.fit(key, filter, case.series, optax.sgd(1.0), 1, **options)
         return float(np.sum(run.parameters["c"] - form.offset(filter.model)))
 
-    expected = exact.score(law, case.y, case.u, "c", form.answer)
-    slack = 0.02 + 0.3 * filter.approximate
-    assert_unbiased([slope(key) for key in KEYS[:10]], expected, loosest=0.1, slack=slack)
+    slopes = [slope(key) for key in KEYS[:10]]
+    if row.name not in OF_ANOTHER_LAW:
+        expected = exact.score(law, case.y, case.u, "c", form.answer)
+        assert_unbiased(slopes, expected, loosest=0.1, slack=0.02 + 0.3 * filter.approximate)
 
 
 # The first share one program for all data, and one more where something is missing.
