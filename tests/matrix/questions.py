@@ -126,25 +126,32 @@ def islands(row, data):
     row.check(data, ratios, *sums)
 
 
-def stepped(row, data, after=lambda filter, mixture: (filter, mixture)):
-    """The mixtures and increments of one run, step by step."""
-    case, filter = row.case(data), row.filter(data)
+def data_of_steps(case):
+    """y_1, None where it is missing, and u_1; and of every step."""
     series = mpfjax.models.series.as_series(case.series, case.model)
-    key_initial, key_steps = jax.random.split(KEYS[0])
 
     def at(tree, t):
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[t]), tree)
 
     is_there = np.ones(len(Y), bool) if series.present is None else np.asarray(series.present)
-    first = at(series.observations, 0) if is_there[0] else None
-    mixture, increments = filter.init(key_initial, first, inputs=at(series.inputs, 0)), []
-    for t, key in enumerate(jax.random.split(key_steps, len(Y))):
-        now = at(series.inputs, t)
-        if is_there[t]:
-            seen = at(series.observations, t)
-            mixture, info = filter.step(key, mixture, seen, inputs=now)
-        else:
+    return [
+        (at(series.observations, t) if is_there[t] else None, at(series.inputs, t))
+        for t in range(len(Y))
+    ]
+
+
+def stepped(row, data, after=lambda filter, mixture: (filter, mixture)):
+    """The mixtures and increments of one run, step by step."""
+    filter, steps = row.filter(data), data_of_steps(row.case(data))
+    key_initial, key_steps = jax.random.split(KEYS[0])
+    mixture, increments = filter.init(key_initial, steps[0][0], inputs=steps[0][1]), []
+    for t, (key, (seen, now)) in enumerate(
+        zip(jax.random.split(key_steps, len(Y)), steps, strict=True)
+    ):
+        if seen is None:
             mixture, info = filter.predict(key, mixture, inputs=now)
+        else:
+            mixture, info = filter.step(key, mixture, seen, inputs=now)
         increments.append(float(info.log_likelihood_increment))
         if t == 1:
             filter, mixture = after(filter, mixture)
@@ -198,6 +205,23 @@ def forecast(row, data):
     found = jax.jit(jax.vmap(ahead))(KEYS, run.final)
     ratios = row.ratios(data, run.log_likelihood_increments)
     row.check(data, ratios, *found, expected=case.answer.ahead)
+
+
+def predictions(row, data):
+    """x_t given y_1..y_{t-1}, of the last step of a run."""
+    case, filter = row.case(data), row.filter(data)
+
+    def before(key):
+        run = mpfjax.run_filter(key, filter, case.series)
+        inputs = case.series.inputs
+        found = mpfjax.one_step_predictions(jax.random.fold_in(key, 7), filter, run, inputs=inputs)
+        last = jax.tree.map(lambda leaf: leaf[-1], found.mixtures)
+        return run.log_likelihood_increments.at[-1].set(0.0), row.moments(last)
+
+    increments, found = jax.jit(jax.vmap(before))(KEYS)
+    answer = row.form.answer(case.law, np.append(case.y[:-1], np.nan), case.u)
+    ratios = np.exp(np.asarray(increments, float) - answer.increments).prod(axis=-1)
+    row.check(data, ratios, *found, expected=(answer.means[-1], answer.variances[-1]))
 
 
 def score_with(change):
@@ -272,23 +296,45 @@ def backward(**options):
     return of_run(draw)
 
 
+def value_of(row):
+    """h of x_{t-1} and x_t of all particles, or of one where the model is `per_particle`."""
+
+    def value(before, now):
+        if jax.tree.leaves(now)[0].ndim > 0:
+            return row.form.value(now)
+        return row.form.value(now[None])[0]
+
+    return value
+
+
 def sums(**options):
     def ask(row, data):
         case, filter = row.case(data), row.filter(data)
 
-        def value(before, now):
-            """x_t of all particles, or of one where the model is `per_particle`."""
-            if jax.tree.leaves(now)[0].ndim > 0:
-                return row.form.value(now)
-            return row.form.value(now[None])[0]
-
         def smooth(key):
-            found = smoothing.smoothed_sums(key, filter, case.series, value, **options)
+            found = smoothing.smoothed_sums(key, filter, case.series, value_of(row), **options)
             return found.run.log_likelihood_increments, found.sums[-1:] / len(Y)
 
         smoothed(row, data, smooth, is_average=True)
 
     return ask
+
+
+def fixed_lag(row, data):
+    """The terms of x_1, ..., x_t where the lag is the whole run."""
+    filter, steps = row.filter(data), data_of_steps(row.case(data))
+    smoother = smoothing.FixedLagSmoother(filter, value_of(row), len(Y) - 1)
+
+    def smooth(key):
+        key, *keys = jax.random.split(key, len(Y) + 1)
+        window = smoother.init(filter.init(key, steps[0][0], inputs=steps[0][1]))
+        increments = []
+        for key, (seen, now) in zip(keys, steps, strict=True):
+            window, estimates, info = smoother.step(key, window, seen, inputs=now)
+            increments.append(info.log_likelihood_increment)
+        return jnp.stack(increments), estimates
+
+    smoothed(row, data, smooth)
 
 
 def genealogy(row, data):
@@ -411,6 +457,7 @@ OTHERS: dict[str, Callable] = {
     "slots": slots,
     "islands": islands,
     "forecast": forecast,
+    "predictions": predictions,
     "derivative": score_with(lambda filter: filter),
     "score": score_with(mpfjax.with_score_gradient),
     "Fisher": fisher,
@@ -418,6 +465,7 @@ OTHERS: dict[str, Callable] = {
     "trajectories, mcmc": backward(method="mcmc"),
     "sums": sums(),
     "sums, mcmc": sums(method="mcmc"),
+    "fixed lag": fixed_lag,
     "genealogy": genealogy,
     "conditional filter": conditional,
     "Metropolis": metropolis,

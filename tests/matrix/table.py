@@ -57,10 +57,10 @@ GAUSSIAN = these("Gaussian", "Gaussian, predictive", "Gaussian mixture", "initia
 METROPOLIS = these("RandomWalkMetropolis", "Metropolis beside stop")
 OF_NOISE = these("point sets", "look-ahead")
 # What asks for the density of a step.
-OF_DENSITY = these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "score", "Gibbs",
-                   "Fisher", "conditional filter")  # fmt: skip
-OF_STATES = these("trajectories, mcmc", "sums", "sums, mcmc", "conditional filter", "Gibbs",
-                  "Fisher")  # fmt: skip
+OF_DENSITY = these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "fixed lag",
+                   "score", "Gibbs", "Fisher", "conditional filter")  # fmt: skip
+OF_STATES = these("trajectories, mcmc", "sums", "sums, mcmc", "fixed lag",
+                  "conditional filter", "Gibbs", "Fisher")  # fmt: skip
 OF_PARENTS = these("genealogy", "trajectories, mcmc", "sums, mcmc", "Fisher")
 OF_PATHS = these("conditional filter", "Gibbs")
 UNBIASED = these("Metropolis", "SMC²")
@@ -141,7 +141,8 @@ RULES = (
          filters=APPROXIMATE, questions=UNBIASED),
     Rule("cannot be smoothed", "a run with a start cannot be smoothed: its state is drawn anew",
          filters=these("start"),
-         questions=these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "genealogy")),
+         questions=these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "fixed lag",
+                         "genealogy")),
     Rule("no particle one parent", "",
          filters=BEGUN | these("IslandInteraction"), questions=these("sums, mcmc", "Fisher")),
     Rule("slots", "filters of separate objects, `bernoulli_filter`, a start and restarts need "
