@@ -57,7 +57,8 @@ class AbstractMetropolis(AbstractMarkovMove):
     - `gradient`: "none" differentiates the draws, "stop" the density of the state after the move,
       as with `gradient` of `Propagate`.
 
-    Raises `ValueError` in a filter of a model without `log_transition`.
+    Raises `ValueError` in a filter of a model without `log_transition`, and for a state of integers
+    alone.
     """
 
     gradient: Gradient = eqx.field(static=True, default="none", kw_only=True)
@@ -132,6 +133,8 @@ class RandomWalkMetropolis(AbstractMetropolis):
 def _as_rows(states: PyTree) -> tuple[Float[Array, "n d"], Callable[[Array], PyTree]]:
     """The floating point numbers of each particle as a row, and what makes states of such rows."""
     floats, rest = eqx.partition(states, eqx.is_inexact_array)
+    if not jax.tree.leaves(floats):
+        raise ValueError("model: a Metropolis move needs a state with floating point numbers")
     unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], floats))[1]
     rows = jax.vmap(lambda one: ravel_pytree(one)[0])(floats)
     return rows, lambda rows: eqx.combine(jax.vmap(unravel)(rows), rest)

@@ -99,6 +99,8 @@ RULES = (
          forms=LINEAR, questions=OF_STATES),
     Rule("floating point", "Gaussian filters do not model whole numbers: exclude them by `where`",
          forms=these("tree", "whole numbers"), filters=GAUSSIAN),
+    Rule("floating point", "Metropolis moves do not move whole numbers, and need other parts",
+         forms=these("whole numbers"), filters=METROPOLIS),
     Rule("which draw is kept|derivatives do not see",
          "`with_score_gradient` refuses moves whose random choices derivatives ignore "
          "(`biases_score`): several proposals per particle, filters of separate objects",
