@@ -1,6 +1,7 @@
 """The result of a run: what it collected, its moments over time, and tables of its components."""
 
 import html
+import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NamedTuple
 
@@ -172,9 +173,17 @@ def component_table(mixture: ParticleMixture) -> ComponentTable:
     for m in np.argsort(-weights):
         if weights[m] > 0:
             pairs = zip(means[m], np.sqrt(variances[m]), strict=True)
-            moments = [f"{mean:.4g} ± {sd:.2g}" for mean, sd in pairs]
+            moments = [_mean_and_deviation(float(mean), float(sd)) for mean, sd in pairs]
             rows.append((str(m), f"{weights[m]:.3f}", f"{sizes[m]:.1f}", *moments[: len(shown)]))
     return ComponentTable(columns, tuple(rows))
+
+
+def _mean_and_deviation(mean: float, deviation: float) -> str:
+    """Both with as many decimals as two digits of the deviation need."""
+    if not (deviation >= 1e-4 and max(abs(mean), deviation) < 1e6):
+        return f"{mean:.4g} ± {deviation:.2g}"
+    decimals = max(0, 1 - math.floor(math.log10(deviation)))
+    return f"{mean:.{decimals}f} ± {deviation:.{decimals}f}"
 
 
 def _coordinates(particles: PyTree) -> list[str]:
