@@ -168,23 +168,23 @@ def _sign_of_life(function: Callable[..., PyTree]) -> Iterator[None]:
 
 
 def _watch() -> None:
-    """Log a line for each call whose thread is in JAX's compiler after some seconds."""
-    reported: set[float] = set()
+    """Log a line, once, for each function whose thread is in JAX's compiler after some seconds."""
+    reported: set[str] = set()
     while _has_calls.wait():
         time.sleep(PATIENCE / 4)
         if not _calls:
             _has_calls.clear()
-            reported.clear()
             if _calls:  # one that came in between
                 _has_calls.set()
         for caller, (start, function) in list(_calls.items()):
             frame = sys._current_frames().get(caller)
-            if start in reported or time.monotonic() - start < PATIENCE or frame is None:
+            name = f"{function.__module__}.{function.__qualname__}"
+            if name in reported or time.monotonic() - start < PATIENCE or frame is None:
                 continue
             modules = {at.f_globals.get("__name__") for at, _ in traceback.walk_stack(frame)}
             if modules & _COMPILERS:
-                reported.add(start)
-                _logger.warning(_WAITING, f"{function.__module__}.{function.__qualname__}")
+                reported.add(name)
+                _logger.warning(_WAITING, name)
 
 
 PATIENCE = 3.0

@@ -73,7 +73,7 @@ def test_a_step_says_what_it_saw_and_its_program_calls_nothing_back(transform):
 
 
 def test_a_line_is_logged_while_a_program_is_compiled(monkeypatch, caplog):
-    """Once, and not where the program is there already."""
+    """Once for each function, however many shapes it is compiled for."""
     monkeypatch.setattr(compiling, "PATIENCE", 0.1)
 
     def slow(x):
@@ -86,5 +86,5 @@ def test_a_line_is_logged_while_a_program_is_compiled(monkeypatch, caplog):
     assert len(lines) == 1
     assert "slow for more than" in lines[0]
     assert "enable_compilation_cache" in lines[0]
-    program(jnp.zeros(2))
+    program(jnp.zeros(3))
     assert len([record for record in caplog.records if record.name == "mpfjax"]) == 1
