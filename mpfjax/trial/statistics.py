@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import logsumexp
 
 # Of a right model, sums are as improbable as this once in a million keys.
 _LEAST_CHANCE = 1e-6
@@ -20,7 +21,7 @@ def origin_faults(
     If the density is right but for a factor of the draw alone, draw i comes from the state j of its
     family with the probability p_ij = exp logs_ij / Σ_k exp logs_ik. So the expectation of a value
     v_ii at the true origins is Σ_j p_ij v_ij, whatever v is: here the log density, and each number
-    of the state.
+    of the state and its square, since a spread may depend on the size of a number alone.
     """
     if np.isnan(logs).any() or not np.isfinite(np.diagonal(logs, axis1=1, axis2=2)).all():
         yield "is NaN, or infinite at a draw of {0}"
@@ -28,7 +29,9 @@ def origin_faults(
     shares = np.exp(logs - logs.max(axis=2, keepdims=True))
     shares /= shares.sum(axis=2, keepdims=True)
     values = [(name, np.where(shares > 0, logs, 0.0))]
-    values += [(x, np.broadcast_to(each[:, None], logs.shape)) for each in parents]
+    for each in parents:
+        columns = {x: each, f"({x})²": (each - each.mean()) ** 2}
+        values += [(k, np.broadcast_to(v[:, None], logs.shape)) for k, v in columns.items()]
     for what, of_siblings in values:
         of_parent = np.diagonal(of_siblings, axis1=1, axis2=2)
         relative = of_siblings - np.sum(shares * of_siblings, axis=2, keepdims=True)
@@ -39,9 +42,10 @@ def origin_faults(
         if log_chance < np.log(_LEAST_CHANCE):
             mean, error = excess / of_parent.size, deviation / of_parent.size
             yield (
-                f"is not the log density of {{0}}: given the {x} that draws come from, {what} is"
-                f" {mean:.2g} ± {error:.2g} above what it says; is it a density for its logarithm,"
-                f" a variance for a standard deviation, or does a factor that depends on {x} lack?"
+                f"is not the log density of {{0}}: averaged over the {x} that the draws come from,"
+                f" {what} differs by {mean:+.2g} ± {error:.2g} from what the density predicts; is"
+                " it a density in place of its logarithm, a variance in place of a standard"
+                f" deviation, or is a factor that depends on {x} missing?"
             )
 
 
@@ -55,8 +59,7 @@ def _log_chance(values: np.ndarray, shares: np.ndarray, excess: float, deviation
     if deviation == 0:
         return -np.inf
     slopes = np.geomspace(1e-4, 1e2, 41) / deviation
-    with np.errstate(over="ignore"):
-        bounds = [np.log(np.sum(shares * np.exp(k * values), axis=2)).sum() for k in slopes]
+    bounds = [logsumexp(k * values, axis=2, b=shares).sum() for k in slopes]
     return float(np.min(np.asarray(bounds) - slopes * excess))
 
 
@@ -88,9 +91,9 @@ def density_faults(columns: list[np.ndarray], log_densities: np.ndarray) -> Iter
     if is_above.any() or (means.size and is_below.all()):
         k = np.argmax((means - 1) / errors if is_above.any() else means)
         yield (
-            f"is not the log density of {{0}}: the mean of f / density over draws is {means[k]:.2g}"
-            f" ± {errors[k]:.2g} for a normal density f, and 1 if it is right; is it a density for"
-            " its logarithm, or does a factor (of a change of variables) lack?"
+            "is not the log density of {0}: the mean of f / density over draws should be 1, and is"
+            f" {means[k]:.2g} ± {errors[k]:.2g} for a normal density f; is it a density in place of"
+            " its logarithm, or is a normalising constant or a Jacobian missing?"
         )
 
 
