@@ -328,10 +328,19 @@ def _rule(hint: Any) -> Rule | None:
 
 
 def _keys(kind: Any) -> Rule:
-    """The rule for one typed key, or for a row of them."""
-    what = "a row of typed keys, as jax.random.split(jax.random.key(0), runs)"
+    """The rule for one typed key, or for a row of them, whose runs would be the same if equal."""
+    what = "a row of different typed keys, as jax.random.split(jax.random.key(0), runs)"
     what = what if kind.dims else "one typed key, as jax.random.key(0)"
-    return Rule(lambda value: isinstance(value, kind) and value.size > 0, what)
+
+    def holds(value: Any) -> bool:
+        if not isinstance(value, kind) or value.size == 0:
+            return False
+        if value.ndim != 1 or isinstance(value, Tracer):
+            return True
+        data = np.asarray(jax.random.key_data(value))
+        return len(np.unique(data, axis=0)) == len(data)
+
+    return Rule(holds, what)
 
 
 def is_key(value: Any) -> bool:

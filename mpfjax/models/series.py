@@ -178,7 +178,8 @@ def present_steps(observations: PyTree, series: Series, fault: str) -> Any:
         elif numpy is np:
             _warn_of_parts(observations, present & ~usable)
         present = present & is_observed
-    hint = "; Series.skipping(observations) takes them as missing" * (fault == NOT_FINITE)
+    missing = "; if it is missing, run_filter(..., missing='skip') or Series.skipping(observations)"
+    hint = missing * (fault == NOT_FINITE)
     present = refuse_where(present & ~usable, present, f"observations: {fault}", hint)
     return None if numpy is np and present.all() else jnp.asarray(present)
 
