@@ -87,11 +87,7 @@ def odometry_steps(
     Raises `ValueError` for one of the two alone, and for turns of more than 2π from one pose to the
     next, as headings in degrees make.
     """
-    rows = to_rows(3, "poses", poses)
-    turns = np.abs(np.diff(rows[:, 2]))
-    if turns.size and np.nanmax(turns) > 2 * np.pi + 0.01:
-        degrees = "is more than a full turn; headings are in radians, np.deg2rad(...)"
-        raise ValueError(f"poses: a turn of {np.nanmax(turns):.4g} from one to the next {degrees}")
+    rows = _poses_of(poses)
     if (min_distance is None) != (min_turn is None):
         raise ValueError(f"min_distance, min_turn: {min_distance}, {min_turn}; give both or none")
     if min_distance is None or min_turn is None:
@@ -110,15 +106,26 @@ def _steps(poses: np.ndarray) -> np.ndarray:
     return np.stack([cos * x + sin * y, cos * y - sin * x, wrap(turn)], axis=1)
 
 
+def _poses_of(poses: Any) -> Float[np.ndarray, "t 3"]:
+    """Poses as float64, whose headings are in radians."""
+    rows = to_rows(3, "poses", poses)
+    turns = np.abs(np.diff(rows[:, 2]))
+    if turns.size and np.nanmax(turns) > 2 * np.pi + 0.01:
+        degrees = "is more than a full turn; headings are in radians, np.deg2rad(...)"
+        raise ValueError(f"poses: a turn of {np.nanmax(turns):.4g} from one to the next {degrees}")
+    return rows
+
+
 @checked
 def interpolated_poses(times: Any, pose_times: Any, poses: Any) -> Float[np.ndarray, "s 3"]:
     """Poses at the time stamps of scans, (s,), from poses of odometry, (t,) and (t, 3).
 
     Positions are interpolated linearly, headings along the shorter turn. Raises `ValueError` for
-    times of poses that do not increase, and for scans before the first pose or after the last one.
-    Use it before `odometry_steps` if scans and odometry have separate time stamps.
+    times of poses that do not increase, for scans before the first pose or after the last one, and
+    for headings in degrees, as `odometry_steps`. Use it before `odometry_steps` if scans and
+    odometry have separate time stamps.
     """
-    rows, at = to_rows(3, "poses", poses), np.asarray(times, float)
+    rows, at = _poses_of(poses), np.asarray(times, float)
     knots = np.asarray(pose_times, float)
     if knots.shape != (len(rows),) or not (np.diff(knots) > 0).all():
         raise ValueError(f"pose_times: {knots.shape}, not rising times, one for each pose")
