@@ -167,7 +167,7 @@ def asking(model: Any, method: str, argument: str = "", value: Any = None) -> It
         clauses = [f"given {argument} {shown(value)}"] if argument else []
         is_users = not type(model).__module__.startswith("mpfjax.")
         if getattr(model, "inputs", ()) is None and is_users:
-            clauses.append("its inputs None, as the call gives no u_t")
+            clauses.append("whose `inputs` is None: pass inputs= to the call")
         with saying(f"model: {model_name(model)}.{method}", ", ".join(clauses)):
             raise
 
@@ -225,11 +225,11 @@ def check_moved(
 
 def real_each(values: Any, num_particles: int, asked: Any, method: str = "") -> Float[Array, " n"]:
     """What a method of a model returned, or a function that `asked` names; a `ValueError` unless
-    it is one real number a particle.
+    it is one real number per particle.
     """
     if getattr(values, "shape", None) != (num_particles,) or jnp.iscomplexobj(values):
         who = f"model: {model_name(asked)}.{method}" if method else asked
-        real = f"one real value a particle, ({num_particles},)"
+        real = f"one real value per particle, ({num_particles},)"
         raise ValueError(f"{who} returned {shown(values)}, not {real}")
     return jnp.asarray(values)
 

@@ -75,7 +75,7 @@ def test_an_input_of_a_step_that_is_nan_or_not_there_is_an_error():
         FILTER.step(KEY, FILTER.init(KEY), OBSERVATIONS[0], inputs=jnp.array(np.nan))
     with pytest.raises(TypeError) as caught:
         FILTER.step(KEY, FILTER.init(KEY), OBSERVATIONS[0])
-    assert "its inputs None, as the call gives no u_t" in "".join(caught.value.__notes__)
+    assert "whose `inputs` is None: pass inputs= to the call" in "".join(caught.value.__notes__)
 
 
 @pytest.mark.exactness
