@@ -161,6 +161,44 @@ def drawn(key: Key[Array, ""], problem: Problem, sample_prior: SamplePrior, num:
     return reals
 
 
+def require_same_prior(
+    key: Key[Array, ""], problem: Problem, prior: Prior, sample_prior: SamplePrior
+) -> None:
+    """Raise a `ValueError` unless `sample_prior` draws from the prior.
+
+    A Metropolis step by the prior then leaves the distribution of the draws as it is. Means of
+    bounded functions of each number are compared, before and after it; a constant that the prior
+    leaves out cancels.
+    """
+    num = 8192
+    draws = drawn(key, problem, sample_prior, num)
+    rows, log_priors, moved, after = map(np.asarray, _metropolis_step(key, prior, draws))
+    if not np.isfinite(log_priors).all():
+        return  # said elsewhere
+    centre, scale = np.median(rows, axis=0), np.subtract(*np.quantile(rows, [0.75, 0.25], axis=0))
+    shares = np.exp(np.minimum(np.where(np.isnan(after), -np.inf, after) - log_priors, 0.0))
+    before, then = (np.tanh((each - centre) / scale) for each in (rows, moved))
+    changes = shares[:, None] * np.hstack([then - before, then**2 - before**2])
+    errors = changes.std(axis=0) / np.sqrt(num)
+    if (np.abs(changes.mean(axis=0)) > 6.0 * errors).any():
+        raise ValueError(
+            "log_prior: it is not the log density of the draws of sample_prior: a Metropolis step"
+            " by it changes their distribution; is a factor missing, such as 1 / θ for a normal log"
+            " θ?"
+        )
+
+
+@eqx.filter_jit
+def _metropolis_step(key: Key[Array, ""], prior: Prior, draws: Reals) -> tuple[Array, ...]:
+    """Draws in rows and their log density, and the same of a proposal for each."""
+    _, shaped = ravel_pytree(jax.tree.map(lambda u: u[0], draws))
+    rows = jax.vmap(lambda reals: ravel_pytree(reals)[0])(draws)
+    low, high = jnp.quantile(rows, jnp.array([0.25, 0.75]), axis=0)
+    moved = rows + (high - low)[None] * jax.random.normal(key, rows.shape)
+    before, after = (jax.vmap(lambda row: prior(shaped(row)))(each) for each in (rows, moved))
+    return rows, before, moved, after
+
+
 def is_invalid(log_density: Float[Array, "*n"]) -> Bool[Array, "*n"]:
     """Whether a log density is no number: NaN or +inf."""
     return ~(log_density < jnp.inf)

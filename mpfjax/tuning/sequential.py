@@ -13,7 +13,13 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.series import Series
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State
 from mpfjax.tuning.chains import warn_of_invalid
-from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn
+from mpfjax.tuning.densities import (
+    LogPrior,
+    SamplePrior,
+    checked_prior,
+    drawn,
+    require_same_prior,
+)
 from mpfjax.tuning.evidence import UnbiasedFilter, one_sequence, pose_evidence, with_present
 from mpfjax.tuning.parameter_particles import Sampler, extend, rejuvenate, start
 from mpfjax.tuning.problem import Parameters, Problem, Transforms
@@ -185,22 +191,24 @@ def smc2(
 
     Raises `ValueError` for a filter that is `approximate`, numbers below one, `num_samples` that
     `num_moves` + 1 does not divide, draws of the prior of other names, shapes or domains than the
-    parameters or with a density that is not finite, a list of sequences, and as `fit` does;
-    `RuntimeError` if every θ has zero likelihood at the first observation. Use it to follow a
-    posterior in time, for posteriors with several modes, and to compare models;
+    parameters, a `log_prior` that is not their log density up to a constant, a list of sequences,
+    and as `fit` does; `RuntimeError` if every θ has zero likelihood at the first observation. Use
+    it to follow a posterior in time, for posteriors with several modes, and to compare models;
     `metropolis_hastings` is simpler if only the last posterior is needed.
     """
     size = num_moves + 1
     if num_samples % size:
         low = max(num_samples - num_samples % size, size)
         raise ValueError(
-            f"num_samples: {num_samples} is no multiple of num_moves + 1: {low} or {low + size}"
+            f"num_samples: {num_samples} is not a multiple of num_moves + 1 = {size}; use {low} or"
+            f" {low + size}"
         )
     series = jax.tree.map(np.asarray, one_sequence(observations, filter.model))
     problem = pose_evidence(filter, series, parameters, transforms)
     key_prior, key_filters, key_steps = jax.random.split(key, 3)
     reals = drawn(key_prior, problem, sample_prior, num_samples)
     prior = checked_prior(log_prior, problem, key_prior, sample_prior)
+    require_same_prior(jax.random.fold_in(key_prior, 1), problem, prior, sample_prior)
     sampler = Sampler(problem, _pad(series, series.length), prior, int(num_moves))
     settings = problem.settings | {
         "key": key, "num_samples": int(num_samples), "num_moves": int(num_moves),

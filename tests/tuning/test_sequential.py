@@ -4,12 +4,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.scipy.stats import norm
 
 import mpfjax
 from mpfjax import Checkpoint, Series
+from mpfjax.tuning import Positive, smc2
 from mpfjax.tuning import sequential as observing
-from mpfjax.tuning import smc2
-from tests.tuning.exact_posteriors import OBSERVATIONS, A, log_prior_of_a, sample_a
+from tests.tuning.exact_posteriors import (
+    DEVIATION_OF_A,
+    MEAN_OF_A,
+    OBSERVATIONS,
+    A,
+    log_prior_of_a,
+    sample_a,
+)
 from tests.user_models import ScalarLinear
 
 SERIES = Series.skipping(OBSERVATIONS)
@@ -44,6 +52,25 @@ class Faulty(ScalarLinear):
 def test_likelihoods_that_are_none_are_an_error(value, named):
     with pytest.raises(RuntimeError, match=named):
         sample(filter=mpfjax.particle_filter(Faulty(r=value), 10))
+
+
+def sample_log_normal(key):
+    return {"a": jnp.exp(sample_a(key)["a"])}
+
+
+@pytest.mark.parametrize(
+    ("log_prior", "sample_prior"),
+    [
+        (lambda p: norm.logpdf(p["a"], MEAN_OF_A, DEVIATION_OF_A**2), sample_a),
+        (lambda p: -log_prior_of_a(p), sample_a),
+        (lambda p: log_prior_of_a({"a": jnp.log(p["a"])}), sample_log_normal),
+    ],
+    ids=["a variance", "a sign", "no Jacobian"],
+)
+def test_a_prior_must_be_that_of_its_draws(log_prior, sample_prior):
+    transforms = {"a": Positive()} if sample_prior is sample_log_normal else {}
+    with pytest.raises(ValueError, match="log_prior: it is not the log density of the draws"):
+        sample(log_prior=log_prior, sample_prior=sample_prior, transforms=transforms)
 
 
 ROWS = ("log_likelihood_increments", "effective_sample_sizes", "acceptance_rates")
