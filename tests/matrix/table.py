@@ -141,14 +141,14 @@ RULES = (
     Rule("unbiased likelihood",
          "`metropolis_hastings` and `smc2` refuse filters that are `approximate`",
          filters=APPROXIMATE, questions=UNBIASED),
-    Rule("cannot be smoothed", "a run with a start cannot be smoothed: its state is drawn anew",
+    Rule("cannot be smoothed", "a run with an initialisation is not smoothed: its state is redrawn",
          filters=these("start"),
          questions=these("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "fixed lag",
                          "genealogy")),
     Rule("no particle one parent", "",
          filters=BEGUN | these("IslandInteraction"), questions=these("sums, mcmc", "Fisher")),
-    Rule("slots", "filters of separate objects, `bernoulli_filter`, a start and restarts need "
-         "every slot",
+    Rule("slots", "filters of separate objects, `bernoulli_filter`, `with_initialisation` and "
+         "`with_restarts` need every slot",
          filters=JOINT | BEGUN | these("Bernoulli"), questions=these("slots")),
     Rule("islands", "`run_islands` does not support `bernoulli_filter`",
          filters=these("Bernoulli"), questions=these("islands")),
