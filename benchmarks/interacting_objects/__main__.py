@@ -163,7 +163,7 @@ def draw(results: list[dict[str, Any]]) -> Any:
     def panel(scene: str) -> plotting.Panel:
         lines_of_scene = [line for line in results if line["scene"] == scene]
         ends = (lambda line, i=i: line["interval"][i] for i in (0, 1))
-        label = "share of {runs} scenes, with its 95% interval".format_map
+        label = "fraction of {runs} runs, 95% interval".format_map
         lines = plotting.lines_of(lines_of_scene, label, "label", "rate", *ends)
         return plotting.Panel(
             f"{scene}: {SCENES[scene].title}", "recovery", "", lines, (-0.05, 1.05)

@@ -211,9 +211,9 @@ def pair_and_lost(key: Key[Array, ""]) -> Scene:
 
 
 SCENES = {
-    "a": Setting("one of four unseen, and back elsewhere", 4, 200, (3,), lost_object),
-    "b": Setting("one of seven led away by a distracter", 7, 300, (0,), distracted_object),
-    "c": Setting("two pairs of look-alikes cross", 4, 200, (0, 1, 2, 3), crossing_pairs),
-    "d": Setting("one pair, one easy, one unseen", 4, 200, (0, 1, 2, 3), pair_and_lost),
+    "a": Setting("one of four hidden, reappears elsewhere", 4, 200, (3,), lost_object),
+    "b": Setting("one of seven, with a distracter", 7, 300, (0,), distracted_object),
+    "c": Setting("two similar pairs cross", 4, 200, (0, 1, 2, 3), crossing_pairs),
+    "d": Setting("one pair, one easy object, one lost", 4, 200, (0, 1, 2, 3), pair_and_lost),
     "e": Setting("as c, with half the particles", 4, 100, (0, 1, 2, 3), crossing_pairs),
 }
