@@ -13,7 +13,7 @@ TEXT = """# What works with what
 
 This page is for readers who combine a model, a kind of data, a filter and a question. The tests
 combine all of them for one linear Gaussian model in every form in which it can be written
-(`tests/matrix/`): each number is within four standard errors of that of a Kalman filter, or the
+(`tests/matrix/`): each number is within four standard errors of a Kalman filter's, or the
 call is refused with a `ValueError`, or a warning says that the number cannot be trusted.
 
 - Models: {forms}.
