@@ -26,7 +26,6 @@ SIGMA = 0.1
 LOW, HIGH = -2.5, 2.5
 GRID = (-4.0, 4.0, 1601)
 TYPICAL_NUM_PARTICLES = 100
-SEEDS_AT_ONCE = 100
 MOST_SHARED_SLOTS = 1000
 
 LABELS = {
@@ -90,11 +89,9 @@ def main(
         collect=collect,
     )
     unfinished = out / "unfinished"
-    # One cell compiles while the one before it runs; all small filters run in as many slots.
-    cells = mpfjax.run_study(
-        study, unfinished, resume=resume, seeds_at_once=SEEDS_AT_ONCE, cells_at_once=2,
-        num_slots=max(small) if len(small) > 1 else None,
-    )  # fmt: skip
+    # All small filters run in as many slots.
+    slots = max(small) if len(small) > 1 else None
+    cells = mpfjax.run_study(study, unfinished, resume=resume, num_slots=slots)
     results = [summarise(cell, exact_mass) for cell in cells]
     data(out / "score_vs_particles.json", settings=settings, results=results)
     print(table(COLUMNS, sorted(results, key=lambda entry: list(LABELS).index(entry["filter"]))))

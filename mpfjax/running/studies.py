@@ -2,10 +2,8 @@
 
 import importlib
 import itertools
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -20,17 +18,12 @@ from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.series import as_series, check_series
 from mpfjax.operations.logarithms import default_float
+from mpfjax.running import storage
 from mpfjax.running.results import FilterRun
 from mpfjax.running.run import monte_carlo
-from mpfjax.running.storage import (
-    describe_parts,
-    differences,
-    read_described,
-    stable_name,
-    write_described,
-)
 
 Values = Sequence[Any] | np.ndarray | Array
+Row = dict[str, Any]
 
 _STUDY = "study"
 _TAKEN = {"filter", "num_particles", "file", "description", _STUDY}
@@ -82,13 +75,11 @@ class Study(Checked):
 @checked
 def run_study(
     study: Study,
-    directory: str | os.PathLike[str],
+    directory: storage.FilePath,
     *,
     resume: bool = False,
-    seeds_at_once: Count | None = None,
-    cells_at_once: Count = 1,
     num_slots: Count | None = None,
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """Run every cell of a study; with `resume`, continue where it was interrupted or killed.
 
     Each cell is written to a separate file in `directory` as soon as it is finished, so only
@@ -105,8 +96,6 @@ def run_study(
       to this study if names (of filters, `measure` and `collect`), sizes, settings, keys, data and
       versions are the same. The code of functions cannot be compared: use a new directory after you
       change it. False refuses a directory with cells.
-    - `seeds_at_once`: how many seeds share one `vmap`; None is all. Set it if memory is short.
-    - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both.
     - `num_slots`: the length of the particle arrays, as for `monte_carlo`, in all cells with at
       most so many particles. A filter then compiles once for all these N. Use it for small filters,
       if the study spends more time on compiling than on running. A filter that fills every slot,
@@ -127,29 +116,21 @@ def run_study(
     if results:
         print(f"{directory}: {len(results)} cells taken over, {len(pending)} to run")
 
-    def finish(cell: _Cell) -> None:
-        try:
-            measured = _measure(study, cell, seeds_at_once, num_slots)
-        except Exception as error:
-            error.add_note(f"in the cell {cell.description}")
-            raise
-        described_by = {_STUDY: identity} | cell.description
-        write_described(directory / cell.file, measured, described_by)
-        results[cell.file] = cell.description | measured
-
-    bar = tqdm(total=len(cells), initial=len(results), unit="cell", disable=None)
-    with bar, ThreadPoolExecutor(cells_at_once) as pool:
-        # One at once runs in this thread, which has the caller's settings of JAX.
-        in_turn = map if cells_at_once == 1 else pool.map
-        try:
-            for _ in in_turn(finish, pending):
-                bar.update()
-        finally:  # an error ends it after the cells that are running
-            pool.shutdown(cancel_futures=True)
+    with tqdm(total=len(cells), initial=len(results), unit="cell", disable=None) as bar:
+        for cell in pending:
+            try:
+                measured = _measure(study, cell, num_slots)
+            except Exception as error:
+                error.add_note(f"in the cell {cell.description}")
+                raise
+            described_by = {_STUDY: identity} | cell.description
+            storage.write_described(directory / cell.file, measured, described_by)
+            results[cell.file] = cell.description | measured
+            bar.update()
     return [results[cell.file] for cell in cells]
 
 
-def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
+def read_study(directory: storage.FilePath) -> list[Row]:
     """The finished cells of a study, as `run_study` returns them.
 
     It does not need the `Study`, and works while the study runs. Raises `FileNotFoundError` if the
@@ -170,7 +151,6 @@ class _Cell(NamedTuple):
 def _cells(study: Study) -> list[_Cell]:
     """All cells with their filters, built at once: a filter that cannot be built raises first."""
     axes = _axes(study)
-    # Settings are outermost: neighbours, which may compile at once, are then different programs.
     outermost_first = [*study.settings, "num_particles", "filter"]
     cells = []
     for index, values in enumerate(itertools.product(*(axes[k] for k in outermost_first))):
@@ -208,9 +188,9 @@ def _identity(study: Study) -> dict[str, str]:
     """All that has to be the same for a cell to be of this study, as text."""
     package = importlib.import_module(__name__.partition(".")[0])
     versions = f"mpfjax {package.__version__}, jax {jax.__version__}, {default_float()}"
-    functions = {"measure": stable_name(study.measure), "collect": stable_name(study.collect)}
+    functions = {name: storage.stable_name(getattr(study, name)) for name in ("measure", "collect")}
     axes = {name: str(values) for name, values in _axes(study).items()}
-    data = describe_parts(keys=study.keys, observations=study.observations)
+    data = storage.describe_parts(keys=study.keys, observations=study.observations)
     return axes | data | functions | {"versions": versions}
 
 
@@ -220,9 +200,7 @@ def _cell_files(directory: Path) -> list[Path]:
     return [path for _, path in sorted((int(name[1]), path) for name, path in matches if name)]
 
 
-def _read_cells(
-    directory: Path, identity: dict[str, str] | None = None
-) -> dict[str, dict[str, Any]]:
+def _read_cells(directory: Path, identity: dict[str, str] | None = None) -> dict[str, Row]:
     """The finished cells by their files: described, and with what was measured.
 
     They are all of one study, that of the first where none is given.
@@ -230,35 +208,25 @@ def _read_cells(
     # An error, not a warning and a second run: if one file is damaged, others may be as well.
     results = {}
     for path in _cell_files(directory):
-        arrays, description = read_described(path)
+        arrays, description = storage.read_described(path)
         other = dict(description.pop(_STUDY, {}))
         identity = identity or other
         if other != identity:
-            what = f"of another study ({differences(other, identity)})"
+            what = f"of another study ({storage.differences(other, identity)})"
             raise ValueError(f"directory: {path}: {what}; delete it, and only its cell runs again")
         results[path.name] = description | arrays
     return results
 
 
-def _measure(
-    study: Study, cell: _Cell, seeds_at_once: int | None, num_slots: int | None
-) -> dict[str, np.ndarray]:
-    """All seeds of one cell, a bounded number of them at once."""
-    if num_slots is not None and cell.filter.num_particles > num_slots:
+def _measure(study: Study, cell: _Cell, num_slots: int | None) -> dict[str, np.ndarray]:
+    """What is measured of all seeds of one cell."""
+    filter, keys = cell.filter, study.keys
+    if num_slots is not None and filter.num_particles > num_slots:
         num_slots = None
-    num_seeds = study.keys.shape[0]
-    size = num_seeds if seeds_at_once is None else min(seeds_at_once, num_seeds)
-    parts = []
-    for start in range(0, num_seeds, size):
-        # The last batch is filled up, so that it does not compile again.
-        batch = study.keys[np.clip(np.arange(start, start + size), 0, num_seeds - 1)]
-        run = monte_carlo(
-            batch, cell.filter, study.observations, study.collect, num_slots=num_slots
-        )
-        measured = {name: np.asarray(array) for name, array in study.measure(run).items()}
-        for name, array in measured.items():
-            if name in cell.description or name in _TAKEN or array.shape[:1] != (size,):
-                what = f"{name} of shape {array.shape}"
-                raise ValueError(f"measure: {what} is of a cell, or has no axis of {size} seeds")
-        parts.append(measured)
-    return {name: np.concatenate([part[name] for part in parts])[:num_seeds] for name in parts[0]}
+    run = monte_carlo(keys, filter, study.observations, study.collect, num_slots=num_slots)
+    measured = {name: np.asarray(array) for name, array in study.measure(run).items()}
+    for name, array in measured.items():
+        if name in cell.description or name in _TAKEN or array.shape[:1] != keys.shape:
+            what = f"{name} of shape {array.shape}"
+            raise ValueError(f"measure: {what} is of a cell, or has no axis of {len(keys)} seeds")
+    return measured

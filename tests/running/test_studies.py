@@ -83,24 +83,21 @@ def breaking(error, after):
 
 class TestResults:
     @pytest.mark.exactness
-    @pytest.mark.parametrize("options", [{"seeds_at_once": 3}, {}, {"cells_at_once": 2}])
-    def test_are_those_of_monte_carlo_for_each_cell(self, tmp_path, options):
-        """In batches of three the four seeds keep their keys."""
+    def test_are_those_of_monte_carlo_for_each_cell(self, tmp_path):
         study = small_study(2, filters={"pf": build, "tricky": tricky})
-        results = run_study(study, tmp_path, **options)
+        results = run_study(study, tmp_path)
         cells = [(entry["filter"], entry["num_particles"], entry["noise"]) for entry in results]
         assert cells == [("pf", 8, 0.1), ("tricky", 8, 0.1), ("pf", 8, 1.0), ("tricky", 8, 1.0)]
         for entry, function in zip(results, [build, tricky, build, tricky], strict=True):
             filter = function(entry["num_particles"], entry["noise"])
             run = mpfjax.monte_carlo(study.keys, filter, OBSERVATIONS, mean)
-            # Another batch size may round its sums otherwise.
             np.testing.assert_allclose(entry["evidence"], run.log_marginal_likelihood, rtol=1e-5)
             np.testing.assert_allclose(entry["means"], run.collected, rtol=1e-4)
         np.testing.assert_equal(read_study(tmp_path), results)
         plain = mpfjax.Study(
             {"pf": build}, [8], study.keys, OBSERVATIONS, settings={"noise": [0.1]}
         )
-        (entry,) = run_study(plain, tmp_path / "plain", **options)
+        (entry,) = run_study(plain, tmp_path / "plain")
         np.testing.assert_allclose(entry["log_marginal_likelihood"], results[0]["evidence"], 1e-5)
 
     @pytest.mark.exactness
@@ -119,14 +116,12 @@ class TestResults:
 
 
 class TestBrokenOff:
-    @pytest.mark.parametrize(
-        ("error", "cells_at_once"), [(KeyboardInterrupt(), 2), (RuntimeError("mine"), 1)]
-    )
-    def test_goes_on_with_what_is_left(self, alone, tmp_path, error, cells_at_once):
+    @pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("mine")])
+    def test_goes_on_with_what_is_left(self, alone, tmp_path, error):
         study = small_study(NUM_CELLS, measure=breaking(error, after=2))
         with pytest.raises(type(error)) as caught:
-            run_study(study, tmp_path, cells_at_once=cells_at_once)
-        if cells_at_once == 1:
+            run_study(study, tmp_path)
+        if isinstance(error, RuntimeError):
             assert "'num_particles': 8, 'noise': 0.55" in caught.value.__notes__[0]
         assert len(read_study(tmp_path)) == 2
         finished = {path: path.stat().st_mtime_ns for path in files_of(tmp_path)}
