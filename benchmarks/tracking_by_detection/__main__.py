@@ -245,9 +245,9 @@ def otsu(scores: np.ndarray) -> float:
 
 def result(name: str, sequence: Sequence, run: Run) -> dict[str, Any]:
     """A row of the table."""
-    truth, span = sequence.truth, (sequence.first, sequence.last)
+    truth = sequence.truth.between(sequence.first, sequence.last)
     away = {"ignored": truth.ignored, "min_height": truth.min_height}
-    scores = multi_object_scores(run.rows, truth.objects, span, **away)
+    scores = multi_object_scores(run.rows, truth.objects, **away)
     head = {"tracker": name, "sequence": sequence.name, "detections": sequence.detections}
     kept = {score: round(float(scores[score]), 4) for score in SCORES}
     return head | kept | {SPEED: round(run.frames_per_second, 1)}

@@ -161,8 +161,9 @@ def score(
     scores = [coverage(rows, truth, source.others)._asdict() for rows in tracks]
     for measure in measures if source.all_labelled else measures[:2]:
         result[measure] = float(np.mean([each[measure] for each in scores]))
+    truth = truth[truth[:, 0] >= span[0]]
     try:
-        found = [multi_object_scores(rows, truth, span) for rows in tracks if detect]
+        found = [multi_object_scores(rows, truth) for rows in tracks if detect]
     except ImportError as error:
         print(f"no HOTA, MOTA and IDF1: {error}", file=sys.stderr)
         found = []

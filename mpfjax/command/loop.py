@@ -1,10 +1,10 @@
 """One run of the command: read, detect, track and write, frame by frame."""
 
-import argparse
 import collections
 import contextlib
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Callable, Generator, Iterable, Iterator
 from typing import Any
 
@@ -32,7 +32,7 @@ from mpfjax.vision.tracking.tracker import ObjectTracker
 Start = Callable[[Iterable[np.ndarray] | None], Generator[Tracks, None, None]]
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: Namespace) -> None:
     """Track, and write all results so far, also where the run ends before the frames do."""
     source, tracks = open_source(options), []
     one = (source.path, source.first, source.first)
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
             _write(options, source, tracks, time.perf_counter() - begin)
 
 
-def _start(options: argparse.Namespace, source: Source, still: np.ndarray | None) -> Start:
+def _start(options: Namespace, source: Source, still: np.ndarray | None) -> Start:
     """The requested tracker; raises for any fault in the arguments."""
     if options.box is not None:
         if still is None:
@@ -75,7 +75,7 @@ def _start(options: argparse.Namespace, source: Source, still: np.ndarray | None
     return lambda stills: track(stills, detections, tracker, **settings)
 
 
-def _track(options: argparse.Namespace, source: Source, start: Start, tracks: list[Tracks]) -> None:
+def _track(options: Namespace, source: Source, start: Start, tracks: list[Tracks]) -> None:
     """The loop over frames; where a video is drawn, the tracks are made ahead of it."""
     untracked: collections.deque[np.ndarray | None] = collections.deque()
     has_video = source.has_pixels and not options.no_video
@@ -107,8 +107,7 @@ def _track(options: argparse.Namespace, source: Source, start: Start, tracks: li
     with contextlib.ExitStack() as opened, bar:
         stills = None
         if source.has_pixels:
-            span = source.path, source.first, source.last
-            read = frames.read_frames(*span, times=source.times)
+            read = frames.read_frames(source.path, source.first, source.last, times=source.times)
             stills = record(opened.enter_context(read_ahead(read)))
             # Two threads take twice the processor's time for pictures as small as those of optical
             # flow, and none less by the clock; what detects is best divided among processors.
@@ -133,9 +132,7 @@ def _rows(tracks: list[Tracks], offline: bool) -> np.ndarray:
     return rows if rows.shape[1] == 8 else np.insert(rows, [4, 4], 0.0, axis=1)
 
 
-def _write(
-    options: argparse.Namespace, source: Source, tracks: list[Tracks], seconds: float
-) -> None:
+def _write(options: Namespace, source: Source, tracks: list[Tracks], seconds: float) -> None:
     """The tracks as a whole, and summary.json."""
     rows, n = _rows(tracks, options.offline), len(tracks)
     for name in {TRACKS, FORMATS[options.format]}:
@@ -156,11 +153,12 @@ def _write(
 
 def scores_of(rows: np.ndarray, truth: Truth | None, first: int, last: int) -> dict[str, float]:
     """HOTA, MOTA and IDF1 of rows in these frames, where there is a truth."""
-    if truth is None or not np.any(truth.objects[:, 0] <= last):
+    truth = None if truth is None else truth.between(first, last)
+    if truth is None or not len(truth.objects):
         return {}
     excluded = {"ignored": truth.ignored, "min_height": truth.min_height}
     try:
-        scores = multi_object_scores(rows, truth.objects, (first, last), **excluded)
+        scores = multi_object_scores(rows, truth.objects, **excluded)
     except (ImportError, ValueError) as error:
         print(f"{NO_SCORES}: {error}", file=sys.stderr)
         return {}

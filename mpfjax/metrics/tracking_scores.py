@@ -4,9 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from mpfjax.arrays import (
-    to_rows,
-)
+from mpfjax.arrays import to_rows
 from mpfjax.checks import NotNegative, checked, optional
 
 # The kinds of objects and regions that are not scored, in the second column of their rows.
@@ -19,7 +17,6 @@ _SETTINGS = {"THRESHOLD": 0.5, "PRINT_CONFIG": False}
 def multi_object_scores(
     tracks: Float[np.ndarray, "r 6"],
     truth: Float[np.ndarray, "s 6"],
-    frames: tuple[int, int] | None = None,
     *,
     ignored: Float[np.ndarray, "i 6"] | None = None,
     min_height: NotNegative = 0.0,
@@ -27,10 +24,9 @@ def multi_object_scores(
     """Score tracks against the true boxes as TrackEval does, by the overlap of boxes (IoU).
 
     Both are rows (frame, id, x, y, w, h) as in MOTChallenge files, (x, y) the top-left corner, in
-    pixels. `frames` is the first and the last frame to score; rows outside are ignored. Without it
-    every frame in which either has a box counts. `ignored` and `min_height` are the arguments of
-    `remove_ignored`, which is called first; `read_truth` of `mpfjax.vision` reads all three. The
-    scores:
+    pixels. Every frame in which either has a box counts. `ignored` and `min_height` are the
+    arguments of `remove_ignored`, which is called first; `read_truth` of `mpfjax.vision` reads both
+    and `truth`, and its `between` selects frames. The scores:
 
     - "HOTA", "DetA" and "AssA", Luiten et al. (2021), each the mean over IoU thresholds of 0.05 to
       0.95;
@@ -44,11 +40,6 @@ def multi_object_scores(
     the extra "trackeval". Use it to compare with published trackers.
     """
     tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
-    if frames is not None:
-        first, last = frames
-        tracks, truth = (
-            rows[(first <= rows[:, 0]) & (rows[:, 0] <= last)] for rows in (tracks, truth)
-        )
     if len(truth) == 0:
         raise ValueError("truth: there are no true boxes to score against")
     ignored = np.zeros((0, 6)) if ignored is None else ignored
@@ -61,11 +52,9 @@ def multi_object_scores(
     scores = {name: np.mean(hota[name]) for name in ("HOTA", "DetA", "AssA")}
     scores |= {name: clear[name] for name in ("MOTA", "MOTP")}
     scores |= {
-        "IDF1": identity["IDF1"],
-        "id_switches": clear["IDSW"],
-        "false_positives": clear["CLR_FP"],
-        "misses": clear["CLR_FN"],
-    }
+        "IDF1": identity["IDF1"], "id_switches": clear["IDSW"],
+        "false_positives": clear["CLR_FP"], "misses": clear["CLR_FN"],
+    }  # fmt: skip
     return {name: float(score) for name, score in scores.items()}
 
 

@@ -89,7 +89,7 @@ def test_all_that_is_promised_is_written(sequence, given, tmp_path):
     assert summary["frames_per_second"] * summary["seconds"] == pytest.approx(NUM_FRAMES, 0.01)
     assert summary["peak_memory_mb"] > 50
     assert summary["objects"] == len(np.unique(rows[:, 1])) == 2
-    scores = multi_object_scores(rows, two_walkers(NUM_FRAMES), (1, NUM_FRAMES))
+    scores = multi_object_scores(rows, two_walkers(NUM_FRAMES))
     assert [summary[name] for name in SCORES] == pytest.approx([scores[n] for n in SCORES], 1e-4)
     # Frames are read ahead of the tracks; each has a noise of its own, by which it is known.
     stills = np.stack(list(read_frames(sequence))).astype(float)

@@ -39,13 +39,6 @@ def test_tracks_that_find_nothing(tracks):
     check(multi_object_scores(tracks, TRUTH), **nothing, misses=8, false_positives=len(tracks))
 
 
-@needs_trackeval
-def test_only_the_stretch_counts():
-    """Outside frames 2 and 3 there are a miss, a false positive and a frame without tracks."""
-    tracks = np.vstack([TRUTH[1:6], row(4, 9, 500.0), row(7, 1, 100.0)])
-    check(multi_object_scores(tracks, TRUTH, frames=(2, 3)))
-
-
 def test_overlap_by_hand():
     boxes = np.array([[0.0, 0, 10, 10], [5, 5, 10, 10], [2, 2, -4, 3], [3, 3, 0, 0]])
     objects = np.array([[0.0, 0, 10, 10], [2, 2, 5, 5], [20, 20, 1, 1]])

@@ -22,7 +22,7 @@ def scores_of(folder):
     tracked = track(None, found, tracker, frame_size=info.size)
     rows = np.concatenate([online_rows(tracks) for tracks in tracked])
     away = {"ignored": truth.ignored, "min_height": truth.min_height}
-    found = multi_object_scores(rows, truth.objects, (1, last), **away)
+    found = multi_object_scores(rows, truth.objects, **away)
     return 100 * found["HOTA"], 100 * found["IDF1"], found["id_switches"]
 
 

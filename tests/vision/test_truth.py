@@ -51,7 +51,7 @@ def trackeval_scores(dataset, sequence, name):
 
 def ours(tracks, truth):
     scores = multi_object_scores(
-        tracks, truth.objects, (1, NUM_FRAMES), ignored=truth.ignored, min_height=truth.min_height
+        tracks, truth.objects, ignored=truth.ignored, min_height=truth.min_height
     )
     return {name: scores[name] for name in SCORES}
 
