@@ -48,16 +48,12 @@ class HSVColours(Checked):
     N = N_h N_s + N_v bins in one histogram, Lin et al. (2012), section 2.1, after Pérez, Hue,
     Vermaak and Gangnet (2002). A pixel with a saturation of at least .1 and a value of at least .2
     (both in [0, 1]) is counted in one of N_h N_s bins of hue and saturation. The hue of any other
-    pixel is unreliable: the pixel is counted in one of N_v bins of value. Use it if the
-    illumination changes, or if one histogram should replace three.
-
-    Raises `ValueError` for a number of bins below 1.
+    pixel is unreliable: the pixel is counted in one of N_v bins of value. Each of the three is 10,
+    as in the paper; a subclass may have other numbers. Use it if the illumination changes, or if
+    one histogram should replace three.
     """
 
-    num_hues: Count = eqx.field(static=True, default=10, kw_only=True)
-    num_saturations: Count = eqx.field(static=True, default=10, kw_only=True)
-    num_values: Count = eqx.field(static=True, default=10, kw_only=True)
-
+    num_hues = num_saturations = num_values = 10
     num_channels = 1
     """How many histograms a box has."""
 
@@ -101,8 +97,7 @@ def hue_saturation_value(
         xp.where(high == green, (blue - red) / unit + 2, (red - green) / unit + 4),
     )
     hue = xp.where(chroma > 0, sector / 6, 0.0)
-    saturation = chroma / xp.where(high > 0, high, 1.0)
-    return hue, saturation, high / 255
+    return hue, chroma / xp.where(high > 0, high, 1.0), high / 255
 
 
 def _bin(share: Float[Any, "h w"], num_bins: int) -> Int[Any, "h w"]:
@@ -224,24 +219,17 @@ def _pixel(edges: Float[Array, "n e"], size: int) -> Int[Array, "n e"]:
     return jnp.clip(jnp.ceil(inside - 0.5).astype(jnp.int32), 0, size)
 
 
-def reference_histograms(
-    table: IntegralHistogram, places: Float[Array, "k 4"], num_parts: int, weigh_colours: bool
-) -> tuple[Histograms, Histograms]:
-    """The normalised histograms of reference boxes, and the weights of their colours."""
-    count = eqx.filter_jit(IntegralHistogram.counts)
-    around = places * jnp.array([[1.0, 1.0, SURROUND, SURROUND]], places.dtype)
-    return _weigh(count(table, places, num_parts), count(table, around, 1), weigh_colours)
-
-
 @eqx.filter_jit
-def _weigh(counts, within, weigh_colours):
-    """Histograms by the counts in boxes and in their surroundings, and the weights of colours.
+def reference_histograms(table, places, num_parts, weigh_colours):
+    """The normalised histograms of reference boxes, and the weights of their colours.
 
     A colour is weighed by its share in the box relative to its share in the surroundings.
     """
+    counts = table.counts(places, num_parts)
     weights = jnp.ones_like(counts)
     if weigh_colours:
-        inside = normalise(counts)
+        around = places * jnp.array([[1.0, 1.0, SURROUND, SURROUND]], places.dtype)
+        inside, within = normalise(counts), table.counts(around, 1)
         share = inside + normalise(within - jnp.sum(counts, axis=1, keepdims=True))
         # A colour that is neither in the box nor around it says nothing about the box.
         weights = jnp.where(share > 0, inside / jnp.where(share > 0, share, 1.0), 0.5)

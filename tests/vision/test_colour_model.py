@@ -1,5 +1,7 @@
 """The colour model of section 5.2, against its formulas."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import pytest
 
 from mpfjax import RandomWalk, WalkWithVelocity, check_model
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
+from mpfjax.vision.boxes.recipes import with_one_reference
 from mpfjax.vision.colour import RGBColours
 
 BOXES = np.array([[10.0, 10, 12, 20], [50, 20, 16, 24]])
@@ -111,9 +114,10 @@ VELOCITY = WalkWithVelocity(RandomWalk(jnp.asarray(DEVIATIONS)), 0.5, jnp.asarra
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize("options", [{}, {"switch_probability": 0.3}, {"dynamics": VELOCITY}])
-def test_the_transition_draws_from_its_own_density(frame, options):
-    check_model(jax.random.key(0), model_of(frame, **options), jnp.asarray(frame))
+@pytest.mark.parametrize(("switch", "dynamics"), [(0.0, None), (0.3, None), (0.0, VELOCITY)])
+def test_the_transition_draws_from_its_own_density(frame, switch, dynamics):
+    model = dataclasses.replace(model_of(frame, dynamics=dynamics), switch_probability=switch)
+    check_model(jax.random.key(0), model, jnp.asarray(frame))
 
 
 @pytest.mark.exactness
@@ -131,7 +135,8 @@ def test_dynamics_with_a_velocity_carry_it_along(frame):
 
 
 def test_a_shared_reference_is_the_mean_of_all(frame):
-    own, shared = model_of(frame), model_of(frame, share_reference=True)
+    own = model_of(frame)
+    shared = with_one_reference(own)
     mean = np.asarray(own.references).mean(axis=0)
     np.testing.assert_allclose(np.asarray(shared.references), np.stack([mean, mean]), atol=1e-6)
     np.testing.assert_allclose(np.asarray(shared.reference_boxes[:, 2:]), [[14, 22], [14, 22]])

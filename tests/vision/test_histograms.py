@@ -120,7 +120,11 @@ def one_by_one(frame, box, colours, rows, columns, num_parts):
     return counts
 
 
-@pytest.mark.parametrize("colours", [HSVColours(num_hues=4), RGBColours(5)], ids=["hsv", "rgb"])
+class FewColours(HSVColours):
+    num_hues, num_saturations, num_values = 5, 4, 3
+
+
+@pytest.mark.parametrize("colours", [FewColours(), RGBColours(5)], ids=["hsv", "rgb"])
 @pytest.mark.parametrize("num_parts", [1, 3])
 def test_every_point_counts_once(colours, num_parts):
     shares = sampled_histograms(SMALL, BOXES, colours, num_parts)
@@ -155,8 +159,7 @@ def test_hsv_counts_by_colour_or_by_value(kinds):
     bins = np.where((saturation >= 0.1) & (value >= 0.2), 4 * h + s, 20 + v)
     expected = np.bincount(bins.ravel(), minlength=23)
     assert expected.min() > 0
-    colours = HSVColours(num_hues=5, num_saturations=4, num_values=3)
-    table = integral_histogram(jnp.asarray(kinds), colours, False)
+    table = integral_histogram(jnp.asarray(kinds), FewColours(), False)
     counts = table.counts(jnp.array([[25.0, 20.0, 50.0, 40.0]]), 1)
     assert counts.shape == (1, 1, 1, 23)
     # Float32 may put a pixel on the border of two bins into the other one.

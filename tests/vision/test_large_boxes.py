@@ -1,5 +1,7 @@
 """Boxes of so many pixels that counts in 16 bits would not do, against numpy."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -75,7 +77,8 @@ def test_references_their_weights_and_the_contrast_are_numpys(frame, pixels):
     weighed = inside * weights
     expected = weighed / weighed.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(model.references[0, 0], expected, rtol=1e-5)
-    model = ColourModel.from_frame(frame, box[None], colours=COLOURS, sigma=0.15, contrast=0.5)
+    model = ColourModel.from_frame(frame, box[None], colours=COLOURS, sigma=0.15)
+    model = dataclasses.replace(model, contrast=0.5)
     state = BoxState(jnp.asarray([[x + w / 2, y + h / 2, 1, 1]]), jnp.zeros(1, jnp.int32))
     sides = numpy_shares(frame, grown(box, 2), but_for=box)
     expected = 0.5 * np.sum(1 - np.sum(np.sqrt(sides * inside), axis=1)) / (2 * 0.15**2)
@@ -88,7 +91,8 @@ def test_references_their_weights_and_the_contrast_are_numpys(frame, pixels):
 def test_growing_beyond_all_counts_is_not_rewarded():
     """On one colour throughout, where no size speaks for itself."""
     plain, box = np.full((HEIGHT, WIDTH, 3), 100, np.uint8), np.array([[280.0, 280.0, 60.0, 60.0]])
-    model = ColourModel.from_frame(plain, box, colours=COLOURS, contrast=0.5)
+    model = ColourModel.from_frame(plain, box, colours=COLOURS)
+    model = dataclasses.replace(model, contrast=0.5)
     assert not model.wide_counts
     scales = np.array([1.0, 2.0, 3.0, 3.5, 4.0, 4.2, 4.3, 5.0, 8.0])
     boxes = np.stack([np.full_like(scales, 310), np.full_like(scales, 310), scales, scales], axis=1)

@@ -12,22 +12,11 @@ from mpfjax.checks import Count, NotNegative, Positive, Renamed, Share, checked,
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 from mpfjax.operations.random import fast_key
-from mpfjax.vision.colour import (
-    LARGEST_NARROW,
-    SURROUND,
-    Colours,
-    Histograms,
-    IntegralHistogram,
-    RGBColours,
-    bhattacharyya,
-    integral_histogram,
-    normalise,
-    reference_histograms,
-)
+from mpfjax.vision import colour
 from mpfjax.vision.files.boxes import check_boxes, to_centre
 from mpfjax.vision.files.frames import check_frame
 
-Seen = IntegralHistogram | UInt8[Array, "h w 3"]
+Seen = colour.IntegralHistogram | UInt8[Array, "h w 3"]
 PAPER_VARIANCES = (2.5, 1.5, 0.05, 0.05)
 
 
@@ -97,7 +86,7 @@ class ColourModel(AbstractStateSpaceModel):
     dynamics: AbstractDynamics
     initial_deviations: Float[Array, "k 4"]
     sigma: Float[Array, ""]
-    colours: Colours
+    colours: colour.Colours
     switch_probability: Share = eqx.field(static=True)
     contrast: NotNegative = eqx.field(static=True)
     wide_counts: bool = eqx.field(static=True)
@@ -109,15 +98,12 @@ class ColourModel(AbstractStateSpaceModel):
         frame: UInt8[np.ndarray, "h w 3"],
         boxes: Float[np.ndarray, "k 4"],
         *,
-        colours: Colours | None = None,
+        colours: colour.Colours | None = None,
         sigma: Positive = 0.15,
         deviations: Float[np.ndarray, "..."] | None = None,
         dynamics: AbstractDynamics | None = None,
         num_parts: Count = 1,
         weigh_colours: bool = False,
-        share_reference: bool = False,
-        switch_probability: Share = 0.0,
-        contrast: NotNegative = 0.0,
     ) -> "ColourModel":
         """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
 
@@ -128,31 +114,25 @@ class ColourModel(AbstractStateSpaceModel):
         - `num_parts`: bands from top to bottom.
         - `weigh_colours`: weight each colour by its share in the box relative to its share in the
           surroundings, a box of twice the width and height.
-        - `share_reference`: compare all particles with one reference, the mean of all boxes. The
-          paper also has one B_ref for all players.
-        - `switch_probability`, `contrast`: see the class.
+
+        `switch_probability` and `contrast` are 0; `dataclasses.replace` changes them.
 
         Raises `ValueError`, with the name of the argument, for an argument of another kind, for a
-        frame that is not (h, w, 3) of type uint8, for a box without area or outside the frame, for
-        a number that is not positive, and for a probability outside [0, 1].
+        frame that is not (h, w, 3) of type uint8, for a box without area or outside the frame, and
+        for a number that is not positive.
         """
         check_frame(frame)
         boxes = check_boxes(boxes, *frame.shape[:2])
-        colours = RGBColours() if colours is None else colours
+        colours = colour.RGBColours() if colours is None else colours
         deviations = np.sqrt(PAPER_VARIANCES) if deviations is None else deviations
         steps = jnp.asarray(positive_deviations(deviations, len(boxes)), float)
         steps = jnp.broadcast_to(steps, (len(boxes), 4))
         places = jnp.asarray(to_centre(boxes), float)
-        # Room for boxes to grow to twice the area of the largest reference.
-        room = 2 * np.prod(boxes[:, 2:] + 1, axis=1).max()
-        if contrast > 0 or weigh_colours:
-            room *= SURROUND
-        wide_counts = bool(room > LARGEST_NARROW)
-        table = integral_histogram(jnp.asarray(frame), colours, wide_counts)
-        references, weights = reference_histograms(table, places, num_parts, weigh_colours)
-        if share_reference:
-            references = jnp.broadcast_to(references.mean(0, keepdims=True), references.shape)
-            places = places.at[:, 2:].set(places[:, 2:].mean(0, keepdims=True))
+        # Room for boxes, with their sides, to grow to twice the area of the largest reference.
+        room = 2 * colour.SURROUND * np.prod(boxes[:, 2:] + 1, axis=1).max()
+        wide_counts = bool(room > colour.LARGEST_NARROW)
+        table = colour.integral_histogram(jnp.asarray(frame), colours, wide_counts)
+        references, weights = colour.reference_histograms(table, places, num_parts, weigh_colours)
         return cls(
             reference_boxes=places,
             references=references,
@@ -161,8 +141,8 @@ class ColourModel(AbstractStateSpaceModel):
             initial_deviations=steps,
             sigma=jnp.asarray(sigma, float),
             colours=colours,
-            switch_probability=switch_probability,
-            contrast=contrast,
+            switch_probability=0.0,
+            contrast=0.0,
             wide_counts=wide_counts,
         )
 
@@ -193,9 +173,8 @@ class ColourModel(AbstractStateSpaceModel):
 
     def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
         """log D(x_t | x_{t-1}) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
-        dynamics = self.dynamics_of(previous_states)
-        current, previous = previous_states.box, previous_states.previous
-        log_density = dynamics.log_density(states.box, current, previous)
+        dynamics, current = self.dynamics_of(previous_states), previous_states.box
+        log_density = dynamics.log_density(states.box, current, previous_states.previous)
         drawn = self.switch_probability / self.reference_boxes.shape[0]
         stays = states.reference == previous_states.reference
         probability = jnp.where(stays, 1 - self.switch_probability + drawn, drawn)
@@ -222,28 +201,30 @@ class ColourModel(AbstractStateSpaceModel):
         distances = self.distances(counts, sides, *self.references_of(states))
         return -0.5 * distances / self.sigma**2
 
-    def prepare_observation(self, observation: Seen) -> IntegralHistogram:
+    def prepare_observation(self, observation: Seen) -> colour.IntegralHistogram:
         """The frame's integral histogram; a model of several objects computes it only once."""
-        if isinstance(observation, IntegralHistogram):
+        if isinstance(observation, colour.IntegralHistogram):
             return observation
-        return integral_histogram(observation, self.colours, self.wide_counts)
+        return colour.integral_histogram(observation, self.colours, self.wide_counts)
 
-    def counts(self, observation: Seen, states: BoxState) -> tuple[Histograms, Histograms | None]:
+    def counts(
+        self, observation: Seen, states: BoxState
+    ) -> tuple[colour.Histograms, colour.Histograms | None]:
         """Pixels of each colour in each box, and at its sides if `contrast` is positive."""
         num_parts = self.references.shape[1]
         observation, boxes = self.prepare_observation(observation), self.boxes(states)
         counts = observation.counts(boxes, num_parts)
         if self.contrast == 0:
             return counts, None
-        wide = boxes * jnp.array([[1.0, 1.0, SURROUND, 1.0]], boxes.dtype)
+        wide = boxes * jnp.array([[1.0, 1.0, colour.SURROUND, 1.0]], boxes.dtype)
         return counts, observation.counts(wide, num_parts) - counts
 
     def distances(
         self,
-        counts: Histograms,
-        sides: Histograms | None,
-        weights: Histograms,
-        references: Histograms,
+        counts: colour.Histograms,
+        sides: colour.Histograms | None,
+        weights: colour.Histograms,
+        references: colour.Histograms,
     ) -> Float[Array, " n"]:
         """Σ_c B² - contrast Σ_c B²_around of boxes with these counts, from these references."""
         distances = _distances(counts, weights, references)
@@ -255,7 +236,7 @@ class ColourModel(AbstractStateSpaceModel):
 
     own = Renamed("own", "references_of")
 
-    def references_of(self, states: BoxState) -> tuple[Histograms, Histograms]:
+    def references_of(self, states: BoxState) -> tuple[colour.Histograms, colour.Histograms]:
         """The weights of colours and the references of the particles."""
         weights, references = self.colour_weights, self.references
         # With one reference, a gather costs more than the distance. Under vmap, where
@@ -266,11 +247,11 @@ class ColourModel(AbstractStateSpaceModel):
 
 
 def _distances(
-    counts: Histograms, weights: Histograms, references: Histograms
+    counts: colour.Histograms, weights: colour.Histograms, references: colour.Histograms
 ) -> Float[Array, " n"]:
     """Σ_c B² of counted colours from references, averaged over the bands."""
-    histograms = normalise(counts, weights)
-    distances = bhattacharyya(histograms, jnp.broadcast_to(references, histograms.shape))
+    histograms = colour.normalise(counts, weights)
+    distances = colour.bhattacharyya(histograms, jnp.broadcast_to(references, histograms.shape))
     return jnp.mean(jnp.sum(distances, axis=2), axis=1)
 
 

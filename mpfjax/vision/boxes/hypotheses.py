@@ -106,9 +106,8 @@ def best_components(
     mixture: ParticleMixture, num_objects: int
 ) -> tuple[Int[Array, " k"], Bool[Array, " k"]]:
     """The heaviest component of each object, and whether the object has one at all."""
-    is_own = (
-        component_references(mixture)[None] == jnp.arange(num_objects, dtype=jnp.int32)[:, None]
-    )
+    objects = jnp.arange(num_objects, dtype=jnp.int32)
+    is_own = component_references(mixture)[None] == objects[:, None]
     masses = jnp.where(is_own & mixture.active[None], mixture.log_mixture_weights[None], -jnp.inf)
     return jnp.argmax(masses, axis=1), jnp.max(masses, axis=1) > -jnp.inf
 

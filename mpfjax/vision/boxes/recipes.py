@@ -6,6 +6,7 @@ particle filter of at most 10 components of 20. "objects" has twice as many part
 than three objects more of both, see `most_components`. `PRESETS` has the presets by name.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Generator, Iterable
 from typing import Any
@@ -36,21 +37,15 @@ from mpfjax.vision.colour import RGBColours
 from mpfjax.vision.files.frames import of_one_kind
 from mpfjax.vision.tracking.state import Tracks
 
+Frame, Boxes = UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "k 4"]
 NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
 HYPOTHESES, PARTICLES_PER_HYPOTHESIS = 3, 40
-# Each box is a reference.
-_OWN_REFERENCES: dict[str, Any] = {
-    "colours": RGBColours(16), "sigma": 0.2, "num_parts": 8, "weigh_colours": True,
-    "contrast": 0.25,
-}  # fmt: skip
 
 
-def paper_filters(
-    frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
-) -> dict[str, Filter]:
+def paper_filters(frame: Frame, boxes: Boxes) -> dict[str, Filter]:
     """The paper's model and parameters; thresholds of the MPF are in units of the mean box."""
     size = boxes[:, 2:].mean(axis=0)
-    model = ColourModel.from_frame(frame, boxes, sigma=0.15, share_reference=True)
+    model = with_one_reference(ColourModel.from_frame(frame, boxes, sigma=0.15))
     where: dict[str, Any] = {"features": _centre, "scale": size}
     merge = Merge(None, max_distance=0.5, **where)
     split = Split(4.0, min_distance=0.5, min_share=0.15, **where)
@@ -60,9 +55,7 @@ def paper_filters(
     return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
 
 
-def default_filters(
-    frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
-) -> dict[str, Filter]:
+def default_filters(frame: Frame, boxes: Boxes) -> dict[str, Filter]:
     """The recipe with the highest coverage on real video: any component may follow any object.
 
     A particle is compared with one of the given boxes, and sometimes changes to another. Sometimes
@@ -73,9 +66,8 @@ def default_filters(
     steps = _steps(boxes)
     # Some steps of the places are longer by a factor; sizes never jump.
     walk = RandomWalkWithJumps(steps, steps * np.array([6.0, 6.0, 1.0, 1.0]), 0.05)
-    model = ColourModel.from_frame(
-        frame, boxes, deviations=steps, dynamics=walk, switch_probability=0.05, **_OWN_REFERENCES
-    )
+    model = _model_of_boxes(ColourModel, frame, boxes, steps, walk)
+    model = dataclasses.replace(model, switch_probability=0.05)
     where: dict[str, Any] = {"features": _centre, "scale": size}
     mixture = Filter(
         model,
@@ -97,9 +89,7 @@ def default_filters(
     return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
 
 
-def objects_filters(
-    frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
-) -> dict[str, Filter]:
+def objects_filters(frame: Frame, boxes: Boxes) -> dict[str, Filter]:
     """The recipe with the fewest strays and swaps: every component keeps to its object.
 
     Every particle is compared only with the box that it started from, and learns the current
@@ -116,9 +106,7 @@ def objects_filters(
     # Places keep their velocity, which is about a tenth of a width a frame at first.
     speeds = 0.1 * boxes[:, 2:3] * np.array([[1.0, 1.0, 0.0, 0.0]])
     walk = WalkWithVelocity(walk, (0.1, 0.1, 0.0, 0.0), speeds)
-    model = LearnedColourModel.from_frame(
-        frame, boxes, deviations=steps, dynamics=walk, **_OWN_REFERENCES
-    )
+    model = _model_of_boxes(LearnedColourModel, frame, boxes, steps, walk)
     apart = _apart(size)
     learn = AdaptAppearance(rate=0.03)
     num_components = most_components(len(boxes))
@@ -142,6 +130,23 @@ def objects_filters(
     )
     alone = Filter(model, moves=[Resample(), Propagate(), learn], num_particles=num_particles)
     return {"pf": alone, "mpf": mixture}
+
+
+def with_one_reference(model: ColourModel) -> ColourModel:
+    """The model with the mean of all boxes as the one reference, as the paper has one B_ref."""
+    references, places = model.references, model.reference_boxes
+    references = jnp.broadcast_to(references.mean(0, keepdims=True), references.shape)
+    places = places.at[:, 2:].set(places[:, 2:].mean(0, keepdims=True))
+    return dataclasses.replace(model, references=references, reference_boxes=places)
+
+
+def _model_of_boxes(kind: type[ColourModel], frame: Any, boxes: Any, steps: Any, walk: Any) -> Any:
+    """A model in which each box is a reference."""
+    model = kind.from_frame(
+        frame, boxes, colours=RGBColours(16), sigma=0.2, deviations=steps, dynamics=walk,
+        num_parts=8, weigh_colours=True,
+    )  # fmt: skip
+    return dataclasses.replace(model, contrast=0.25)
 
 
 def most_components(num_objects: int) -> int:
@@ -185,7 +190,7 @@ def _centre_and_reference(states: BoxState) -> Array:
 @checked
 def follow_boxes(
     frames: Iterable[UInt8[np.ndarray, "..."] | None],
-    boxes: Float[np.ndarray, "k 4"],
+    boxes: Boxes,
     *,
     key: Key[Array, ""] | None = None,
     first: Count = 1,

@@ -16,7 +16,14 @@ from mpfjax.vision.tracking.scores import ScoreState
 from mpfjax.vision.tracking.state import TrackerState, Tracks
 from mpfjax.vision.tracking.step import advance
 
-_COLOURS, _BANDS = HSVColours(num_hues=8, num_saturations=4, num_values=6), 3
+
+class _FewColours(HSVColours):
+    """Few bins, for the few points of a detection that are looked at."""
+
+    num_hues, num_saturations, num_values = 8, 4, 6
+
+
+_COLOURS, _BANDS = _FewColours(), 3
 
 
 class ObjectTracker(Checked):
@@ -117,7 +124,6 @@ class ObjectTracker(Checked):
         Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, for a time that is not
         after the previous one, and for detections as `Detections.of` does.
         """
-        del key
         trackable = None
         if detections is not None:
             size = None if frame is None else np.shape(frame)[:2]
