@@ -43,8 +43,9 @@ def imported_modules(path):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import on line {node.lineno}"
-            names = [f"mpfjax.{alias.name}" for alias in node.names]
-            yield from names if node.module == "mpfjax" else [node.module]
+            for name in (f"{node.module}.{alias.name}" for alias in node.names):
+                file = PACKAGE.parent / f"{name.replace('.', '/')}.py"
+                yield name if node.module == "mpfjax" or file.exists() else node.module
 
 
 def test_imports_go_upward():
