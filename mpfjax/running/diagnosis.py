@@ -54,8 +54,7 @@ def sound(run: FilterRun, free: bool = True) -> FilterRun:
         _warn_of_lost(sizes, is_alone | degenerate, weighed | degenerate, np.asarray(increments))
     if run.alarm is not None and np.any(run.alarm[..., -1]):
         alarm = np.asarray(run.alarm)
-        is_lost = alarm[..., -1]
-        which = _in_how_many(is_lost)
+        which = _in_how_many(alarm[..., -1])
         first = int(np.argmax(alarm.reshape(-1, alarm.shape[-1]).any(axis=0)))
         cause = f"at the end, the observations speak against all hypotheses{which}, first at"
         cause += f" index {first} of the steps: run.alarm; mpfjax.with_restarts lets the state"

@@ -5,6 +5,7 @@ If the weights of the islands have become uneven, `IslandInteraction` redistribu
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -87,9 +88,7 @@ def _run_block(keys, filter, series, collect):
 
 @jit_on_wide_vectors
 def _run_on_one(keys, filter, series, collect):
-    def on_device(keys: Key[Array, " islands"]) -> FilterRun:
-        return _run_block(keys, filter, series, collect)
-
+    on_device = partial(_run_block, filter=filter, series=series, collect=collect)
     run = jax.vmap(on_device, axis_name=DEVICE_AXIS)(keys[None])
     return jax.tree.map(lambda leaf: leaf[0], run)
 
@@ -166,7 +165,6 @@ class IslandInteraction(AbstractMove):
 
     def around(self, reference: Any) -> "IslandInteraction":
         """The move itself: on the one island of conditional SMC it does nothing."""
-        del reference
         return self
 
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, ""]:
@@ -178,7 +176,6 @@ class IslandInteraction(AbstractMove):
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:
         """Deal the particles if it is due, unless y_t is missing."""
-        del key
         n, islands = mixture.num_particles, num_islands()
         if islands == 1 or is_missing(now):
             return mixture

@@ -1,6 +1,5 @@
 """Long runs: a loop with a checkpoint file and a progress bar, which ends at Ctrl-C or an error."""
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,14 +11,7 @@ from jaxtyping import PyTree
 from tqdm import tqdm
 
 from mpfjax.checks import Checked, Count, warn
-from mpfjax.running.storage import (
-    arrays_of,
-    describe_parts,
-    differences,
-    read_described,
-    tree_of_arrays,
-    write_described,
-)
+from mpfjax.running import storage
 
 
 class Checkpoint(Checked):
@@ -36,7 +28,7 @@ class Checkpoint(Checked):
     Raises `ValueError` for an `every` below one.
     """
 
-    path: str | os.PathLike[str]
+    path: storage.FilePath
     every: Count = 50
 
 
@@ -107,15 +99,15 @@ class LongRun:
 
     def _identity(self, step: int) -> dict[str, str]:
         """What the file of this run holds of it, up to a step, as text."""
-        return {"caller": self.caller} | describe_parts(**self.settings(step))
+        return {"caller": self.caller} | storage.describe_parts(**self.settings(step))
 
     def _save(self, state: State, pieces: list[PyTree]) -> PyTree:
         """All rows in one piece, written to the file with the state."""
         rows = _concatenate(pieces)
         if self.checkpoint is not None:
-            arrays = arrays_of({"carry": state.carry, "rows": rows})
+            arrays = storage.arrays_of({"carry": state.carry, "rows": rows})
             notes = {"step": state.step, "identity": self._identity(state.step)}
-            write_described(self.checkpoint.path, arrays, notes)
+            storage.write_described(self.checkpoint.path, arrays, notes)
         return rows
 
     def _load(self, like: State) -> State | None:
@@ -123,13 +115,13 @@ class LongRun:
         if self.checkpoint is None or not Path(self.checkpoint.path).exists():
             return None
         path = self.checkpoint.path
-        arrays, notes = read_described(path)
+        arrays, notes = storage.read_described(path)
         step, other = notes.get("step", 0), notes.get("identity", {})
         identity = self._identity(step)
         if other != identity:
-            difference = differences(other, identity)
+            difference = storage.differences(other, identity)
             raise ValueError(f"checkpoint: {path} is of another {self.caller}: {difference}")
-        state = tree_of_arrays(path, arrays, {"carry": like.carry, "rows": like.rows})
+        state = storage.tree_of_arrays(path, arrays, {"carry": like.carry, "rows": like.rows})
         return State(step, state["carry"], state["rows"])
 
 

@@ -166,8 +166,7 @@ def component_table(mixture: ParticleMixture) -> ComponentTable:
     run.collected)`.
     """
     weights, sizes, means, variances = map(np.asarray, _components(mixture))
-    names = _coordinates(mixture.particles)
-    shown = names[:_MOST_COLUMNS]
+    shown = _coordinates(mixture.particles)[:_MOST_COLUMNS]
     columns = ("component", "weight", "eff. size", *(f"{name} (mean ± sd)" for name in shown))
     rows = []
     for m in np.argsort(-weights):
@@ -191,8 +190,7 @@ def _coordinates(particles: PyTree) -> list[str]:
     names = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(points(particles)):
         name = "x" + jax.tree_util.keystr(path)
-        shape = leaf.shape[1:]
-        names += [name + str(list(at)) * bool(at) for at in np.ndindex(*shape)]
+        names += [name + str(list(at)) * bool(at) for at in np.ndindex(*leaf.shape[1:])]
     return names
 
 
@@ -217,9 +215,8 @@ def _variance(mixture: ParticleMixture) -> PyTree:
     together = mixture.replace(
         component_indicators=jnp.zeros_like(mixture.component_indicators), num_components=1
     )
-    covariance = together.component_covariances()[0]
     _, unravel = ravel_pytree(points(mixture.mean()))
-    return unravel(jnp.maximum(covariance.diagonal(), 0.0))
+    return unravel(jnp.maximum(together.component_covariances()[0].diagonal(), 0.0))
 
 
 def _quantiles(

@@ -13,12 +13,7 @@ from mpfjax.memory import at_start
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.series import as_series, series_of
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
-from mpfjax.running.devices import (
-    available_devices,
-    num_processors,
-    over_devices,
-    over_threads,
-)
+from mpfjax.running.devices import available_devices, num_processors, over_devices, over_threads
 from mpfjax.running.diagnosis import sound, warn_of_start
 from mpfjax.running.results import FilterRun
 from mpfjax.running.scan import first_mixture, initial_keys, scan
@@ -124,11 +119,8 @@ def _start_each(keys, filter, series, num_slots):
         slot = jnp.arange(num_slots, dtype=jnp.int32)
         # Those that stay empty hold one of the particles as well.
         filled = at_start(mixture.at(jnp.minimum(slot, number - 1)))
-        return filled.replace(
-            log_weights=jnp.where(slot < number, filled.log_weights, -jnp.inf),
-            ancestor_indices=slot,
-            usable_slots=number,
-        )
+        log_weights = jnp.where(slot < number, filled.log_weights, -jnp.inf)
+        return filled.replace(log_weights=log_weights, ancestor_indices=slot, usable_slots=number)
 
     return jax.vmap(start)(keys)
 

@@ -31,9 +31,7 @@ def scan(
     # Not by `vmap`, under which keys of some generators are split differently.
     keys = jax.lax.map(lambda key: split(key, len(filter.moves)), step_keys)
 
-    def advance(
-        mixture: ParticleMixture, step: tuple[Array, Series]
-    ) -> tuple[ParticleMixture, PyTree]:
+    def advance(mixture: ParticleMixture, step: PyTree) -> tuple[ParticleMixture, PyTree]:
         step_keys, now = step
         mixture, info = step_or_predict(filter, step_keys, mixture, now)
         with saying("collect", "called with the mixture after each step"):
@@ -60,30 +58,21 @@ def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> P
     """
     log_islands = math.log(num_islands())
     first = jax.tree.map(lambda leaf: leaf[0], series)
+    chosen = partial(filter._init, key, first.observations, first.inputs)
     if not filter.weighs_initially:
         # Where it is missing, it tells the form of those that follow.
-        mixture = filter._init(key, first.observations, first.inputs)
+        mixture = chosen()
         return mixture.replace(log_weights=mixture.log_weights - log_islands)
-    if first.present is None:
-        mixture = filter._init(key, first.observations, first.inputs)
-    else:
-        chosen = partial(filter._init, key, first.observations, first.inputs)
+
+    def unseen() -> ParticleMixture:
         # Room for observations is there in any case.
-        mixture = jax.lax.cond(
-            first.present,
-            chosen,
-            lambda: filter._init(key, inputs=first.inputs).replace(memory=chosen().memory),
-        )
+        return filter._init(key, inputs=first.inputs).replace(memory=chosen().memory)
+
+    mixture = chosen() if first.present is None else jax.lax.cond(first.present, chosen, unseen)
     return mixture.replace(log_scale=mixture.log_scale - log_islands)
 
 
-_KEPT = (
-    "resampled",
-    "degenerate",
-    "effective_sample_size",
-    "log_evidence_against_start",
-    "alarm",
-)
+_KEPT = ("resampled", "degenerate", "effective_sample_size", "log_evidence_against_start", "alarm")
 Report = dict[str, PyTree]
 """What a run keeps of a step's report, or of those of all steps."""
 
@@ -98,20 +87,12 @@ def run_of(
     initial: ParticleMixture, final: ParticleMixture, collected: PyTree, reports: Report
 ) -> FilterRun:
     """The `FilterRun` of these steps, whose reports are stacked."""
-    return FilterRun(
-        log_marginal_likelihood=jnp.sum(reports["log_likelihood_increments"]),
-        collected=collected,
-        initial=initial,
-        final=final,
-        **reports,
-    )
+    log_evidence = jnp.sum(reports["log_likelihood_increments"])
+    return FilterRun(log_evidence, collected=collected, initial=initial, final=final, **reports)
 
 
 def step_or_predict(
-    filter: Filter,
-    key: Key[Array, "*keys"],
-    mixture: ParticleMixture,
-    now: Series,
+    filter: Filter, key: Key[Array, "*keys"], mixture: ParticleMixture, now: Series
 ) -> tuple[ParticleMixture, StepInfo]:
     """A step of the filter, or a prediction where the observation is missing; `now` is of one t."""
     if now.present is None:

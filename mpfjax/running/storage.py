@@ -19,11 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+FilePath = str | os.PathLike[str]
+
 _MOST_SHOWN = 4
 _DESCRIPTION = "description"
 
 
-def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
+def save_checkpoint(path: FilePath, state: PyTree) -> None:
     """Write a mixture, or any pytree, from which an online filter can continue, bit for bit.
 
     - `state`: arrays, typed keys and numbers in any pytree, such as `{"mixture": mixture, "t": t}`
@@ -46,7 +48,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
     write_described(path, arrays_of(state), describe(state))
 
 
-def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
+def load_checkpoint(path: FilePath, like: PyTree) -> PyTree:
     """The state that `save_checkpoint` wrote, equal to it to the bit.
 
     - `like`: a state of the same structure, shapes, dtypes and static fields, with any values:
@@ -65,16 +67,11 @@ def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
 
 def arrays_of(state: PyTree) -> dict[str, np.ndarray]:
     """Every array, key and number of a pytree by its place, as a file can hold it."""
-    arrays = {}
-    for place, leaf in jax.tree_util.tree_leaves_with_path(state):
-        if is_data(leaf):
-            arrays[jax.tree_util.keystr(place)] = as_numpy(leaf)
-    return arrays
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return {jax.tree_util.keystr(place): as_numpy(leaf) for place, leaf in leaves if is_data(leaf)}
 
 
-def tree_of_arrays(
-    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], like: PyTree
-) -> PyTree:
+def tree_of_arrays(path: FilePath, arrays: Mapping[str, np.ndarray], like: PyTree) -> PyTree:
     """A pytree like this one with the `arrays_of` another, of these dtypes but of any shapes.
 
     Raises `ValueError` where they do not fit.
@@ -118,11 +115,8 @@ def describe(tree: PyTree, *, values: bool = False) -> dict[str, str]:
 
 def describe_parts(**parts: PyTree) -> dict[str, str]:
     """All leaves of some pytrees with their values, by part and place."""
-    return {
-        f"{part}{place}": text
-        for part, tree in parts.items()
-        for place, text in describe(tree, values=True).items()
-    }
+    texts = {part: describe(tree, values=True) for part, tree in parts.items()}
+    return {f"{part}{place}": text for part in texts for place, text in texts[part].items()}
 
 
 def fingerprint(tree: PyTree) -> str:
@@ -201,7 +195,7 @@ def _static_fields(tree: PyTree, place: tuple[Any, ...]) -> dict[str, str]:
     return texts
 
 
-def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
+def write_whole(path: FilePath, write: Callable[[BinaryIO], object]) -> None:
     """Write a file so that an interruption or an error leaves the old one or the new one.
 
     Several threads and processes may write one path. The file is that of the last one to end, and
@@ -234,7 +228,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_described(
-    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]
+    path: FilePath, arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]
 ) -> None:
     """Write arrays by name as .npz, and a description that JSON can hold; whole or not at all.
 
@@ -248,7 +242,7 @@ def write_described(
     write_whole(path, lambda file: np.savez(file, **content))
 
 
-def read_described(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_described(path: FilePath) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the description that `write_described` wrote; `ValueError` for other files."""
     with open(path, "rb") as file:
         try:
@@ -257,6 +251,5 @@ def read_described(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray],
             arrays = {name: archive[name].view() for name in archive.files}
             return arrays, dict(json.loads(str(arrays.pop(_DESCRIPTION))))
         except Exception as error:  # a flipped bit may lead to any
-            raise ValueError(
-                f"{path}: cut off, damaged or without description ({error})"
-            ) from error
+            fault = f"{path}: cut off, damaged or without description ({error})"
+            raise ValueError(fault) from error
