@@ -9,8 +9,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
@@ -61,6 +59,13 @@ def append_last(rows: PyTree, row: PyTree) -> PyTree:
     return jax.tree.map(lambda before, end: jnp.concatenate([before, end[None]]), rows, row)
 
 
+def after_first(row: PyTree, rows: PyTree) -> PyTree:
+    """The row of the first time, followed by the rows of the later times."""
+    return jax.tree.map(
+        lambda first, later: jnp.concatenate([first[None].astype(later.dtype), later]), row, rows
+    )
+
+
 def log_kernel_from(model: Any, mixture: ParticleMixture) -> Callable[[PyTree], Array]:
     """log D(state | x^i) of every particle, (n,), as a function of a state."""
     n = mixture.num_particles
@@ -94,8 +99,7 @@ def draw_exactly(
         log_weights = jnp.where(mixture.occupied, log_weights, -jnp.inf)
         largest = jnp.max(log_weights)
         weights = exp(log_weights - finite_or_zero(largest))
-        rows = jnp.broadcast_to(weights, (num_draws, n))
-        return draw_columns(quantiles, rows, *within), largest
+        return draw_columns(quantiles, jnp.broadcast_to(weights, (num_draws, n)), *within), largest
 
     number = jax.tree.leaves(futures)[0].shape[0]
     dtype = mixture.log_weights.dtype
@@ -152,9 +156,7 @@ def log_transitions(model: Any, trajectory: PyTree, inputs: PyTree) -> Float[Arr
 
 
 def _or_none(
-    indices: Int[Array, "..."],
-    log_density: Float[Array, "..."],
-    needed: Bool[Array, "..."] | None,
+    indices: Int[Array, "..."], log_density: Float[Array, "..."], needed: Bool[Array, "..."] | None
 ) -> Int[Array, "..."]:
     """The indices, -1 where a future that is needed has no past."""
     lost = ~(log_density > -jnp.inf)
@@ -170,9 +172,3 @@ def rows_at(indices: Int[Array, " k"], rows: PyTree) -> PyTree:
         return jnp.where(along_rows(indices < 0, leaf), jnp.nan, leaf) if is_float else leaf
 
     return jax.tree.map(with_nan, chosen)
-
-
-def check_pasts(indices: Int[Array, "..."]) -> None:
-    """Raise a `RuntimeError` where a state has no past; within a caller's jit there are NaN."""
-    if not isinstance(indices, Tracer) and np.any(np.asarray(indices) < 0):
-        raise RuntimeError(NO_TRANSITION)

@@ -43,10 +43,7 @@ class ConditionalRun(eqx.Module):
 
 @checked
 def conditional_filter(
-    key: Key[Array, ""],
-    filter: Filter,
-    observations: PyTree,
-    trajectory: PyTree,
+    key: Key[Array, ""], filter: Filter, observations: PyTree, trajectory: PyTree
 ) -> ConditionalRun:
     """Run a filter conditionally on a trajectory, and draw a new one from all its particles.
 
@@ -116,8 +113,7 @@ def renew(
     initial = around._init(initial_keys(key_run, around), particles=start)
     run = scan(key_run, around, series, None, initial=initial)
     slots = run.collected.memory[REFERENCE].slot
-    log_weights = jax.vmap(at)(run.collected.log_weights, slots)
-    is_alive = (log_weights > -jnp.inf) & ~run.degenerate
+    is_alive = (jax.vmap(at)(run.collected.log_weights, slots) > -jnp.inf) & ~run.degenerate
     return ConditionalRun(
         trajectory=draw_trajectory(key_back, filter.model, run, series.inputs),
         run=run,
@@ -137,8 +133,7 @@ def possible_times(model: Any, trajectory: PyTree, inputs: PyTree) -> Bool[Array
     start = jnp.ones(1, bool)
     if callable(getattr(model, "log_initial", None)):
         start = model.log_initial(jax.tree.map(lambda leaf: leaf[:1], trajectory)) > -jnp.inf
-    later = log_transitions(model, trajectory, inputs) > -jnp.inf
-    return jnp.concatenate([start, later])
+    return jnp.concatenate([start, log_transitions(model, trajectory, inputs) > -jnp.inf])
 
 
 def check_conditional(filter: Filter, needed_by: str) -> None:
@@ -158,19 +153,14 @@ def check_conditional(filter: Filter, needed_by: str) -> None:
 
 def shape_of_trajectory(model: Any, length: int) -> PyTree:
     """The shapes and types of x_0, ..., x_t of a model, t + 1 being the length."""
-    states = jax.eval_shape(lambda key: law_of(model).sample_initial(key, 1), jax.random.key(0))
-
-    def in_time(leaf: Any) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((length, *leaf.shape[1:]), leaf.dtype)
-
-    return jax.tree.map(in_time, states)
+    law = law_of(model)
+    return jax.eval_shape(lambda key: law.sample_initial(key, length), jax.random.key(0))
 
 
 def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> PyTree:
     """The trajectory as arrays; a `ValueError` for one of other shapes or types than the states."""
     like, arrays = shape_of_trajectory(model, length), rows_of(trajectory, "trajectory")
     if kinds(arrays) != kinds(like):
-        raise ValueError(
-            f"trajectory: {kinds(arrays)} is not {kinds(like)}, x_0 and a state per step"
-        )
+        states = f"{kinds(like)}, x_0 and a state per step"
+        raise ValueError(f"trajectory: {kinds(arrays)} is not {states}")
     return jax.tree.map(jnp.asarray, arrays)

@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count, check_one_each, checked
@@ -12,6 +11,7 @@ from mpfjax.models.base import with_inputs
 from mpfjax.models.series import steps_of_inputs
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.running.results import FilterRun
+from mpfjax.smoothing.backward import after_first
 
 
 class Forecast(eqx.Module):
@@ -77,23 +77,18 @@ def one_step_predictions(
     """
     if not isinstance(run.collected, ParticleMixture) or run.collected.log_weights.ndim != 2:
         raise ValueError("run: it has not the mixtures of one run; collect them by collect=None")
-    before = jax.tree.map(
-        lambda first, later: jnp.concatenate([first[None], later[:-1]]), run.initial, run.collected
-    )
+    before = jax.tree.map(lambda leaf: leaf[:-1], after_first(run.initial, run.collected))
     inputs = steps_of_inputs(inputs, len(run.degenerate), filter.model, "run")
     return _predictions(key, filter, before, inputs)
 
 
 @jit_with_floats_traced
 def _forecast(key, filter, mixture, inputs, num_steps):
-    def advance(
-        mixture: ParticleMixture, step: tuple[Array, PyTree]
-    ) -> tuple[ParticleMixture, Forecast]:
+    def advance(mixture: ParticleMixture, step: PyTree) -> tuple[ParticleMixture, Forecast]:
         ahead = _one_ahead(filter, step[0], mixture, step[1])
         return ahead.mixtures, ahead
 
-    steps = (jax.random.split(key, num_steps), inputs)
-    return jax.lax.scan(advance, mixture, steps)[1]
+    return jax.lax.scan(advance, mixture, (jax.random.split(key, num_steps), inputs))[1]
 
 
 @jit_with_floats_traced

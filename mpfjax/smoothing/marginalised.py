@@ -37,7 +37,7 @@ from mpfjax.models.gaussians import (
 from mpfjax.models.law import law_of
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
-from mpfjax.smoothing.backward import append_last, draw_ends, draw_exactly, rows_at
+from mpfjax.smoothing.backward import after_first, append_last, draw_ends, draw_exactly, rows_at
 
 
 class Information(NamedTuple):
@@ -94,8 +94,7 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     following = jax.tree.map(lambda leaf: leaf[1:], latents)
     start = law_of(model).start(jax.tree.map(lambda leaf: leaf[0], latents))
     _, later = jax.lax.scan(forth, start, (following, observations, inputs))
-    filtered = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows]), start, later)
-    smoothed = jax.vmap(_smoothed)(filtered, futures)
+    smoothed = jax.vmap(_smoothed)(after_first(start, later), futures)
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), smoothed), indices
 
 
@@ -152,8 +151,7 @@ def _before(
     vector = vector - apply(precision, offset)
     root = cholesky(noise)
     half = solve_lower(_one_plus(precision, root), transpose(product(precision, root)))
-    white = solve_lower(_one_plus(precision, root), apply(transpose(root), vector)[:, None])
-    white = white[:, 0]
+    white = solve_lower(_one_plus(precision, root), apply(transpose(root), vector)[:, None])[:, 0]
     precision = precision - product(transpose(half), half)
     vector = vector - apply(transpose(half), white)
     back = transpose(matrix)
@@ -164,8 +162,7 @@ def _one_plus(
     precision: Float[Array, "d d #n"], root: Float[Array, "d d #n"]
 ) -> Float[Array, "d d #n"]:
     """The factor of I + Γᵀ Ω Γ."""
-    d = precision.shape[0]
-    identity = jnp.eye(d, dtype=precision.dtype)[:, :, None]
+    identity = jnp.eye(precision.shape[0], dtype=precision.dtype)[:, :, None]
     return cholesky(identity + sandwich(transpose(root), precision), floor=True)
 
 
@@ -213,8 +210,7 @@ def _smoothed(state: MarginalisedState, future: Information) -> MarginalisedStat
     """The moments of x_s given y_1..y_s and the likelihood of the future."""
     n, law = state.mean.shape[0], linear.gaussian_of(state)
     root = cholesky(law.covariance)
-    factor = _one_plus(future.precision, root)
-    half = solve_lower(factor, transpose(root))
+    half = solve_lower(_one_plus(future.precision, root), transpose(root))
     covariance = symmetric(product(transpose(half), half))
     pull = future.vector - apply(future.precision, law.mean - future.centre)
     mean = law.mean + apply(covariance, pull)

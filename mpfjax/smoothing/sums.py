@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.checks import Checked, CountOrZero, check_one_each, checked, saying
@@ -20,21 +19,14 @@ from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.observations import one_input, one_observation
 from mpfjax.models.series import as_series
 from mpfjax.moves.base import check_keep_parents
-from mpfjax.operations.compiling import jit_with_floats_traced
+from mpfjax.operations.compiling import is_traced, jit_with_floats_traced
 from mpfjax.operations.logarithms import as_inexact
 from mpfjax.operations.random import split
 from mpfjax.report import StepInfo
 from mpfjax.running.diagnosis import sound
 from mpfjax.running.results import FilterRun
 from mpfjax.running.scan import first_mixture, report_of, run_of, step_or_predict
-from mpfjax.smoothing.backward import (
-    NO_TRANSITION,
-    draw,
-    draw_exactly,
-    log_kernel_from,
-    rows_at,
-    walk,
-)
+from mpfjax.smoothing import backward
 from mpfjax.smoothing.trajectories import NO_PAST
 
 # Particles drawn for each particle's past. With one, few distinct particles of early times are
@@ -125,17 +117,6 @@ class Terms(NamedTuple):
     means: PyTree
     variances: PyTree
 
-    def row(self, r: Any) -> "Terms":
-        """One of the terms."""
-        return jax.tree.map(lambda leaf: leaf[r], self)
-
-    def estimates_in(self, mixture: ParticleMixture) -> "Terms":
-        """Over all particles; the variance is of the means, plus the mean of the variances."""
-        between = jax.tree.map(mixture.variance, self.means)
-        within = jax.tree.map(mixture.expectation, self.variances)
-        means = jax.tree.map(mixture.expectation, self.means)
-        return Terms(means, jax.tree.map(jnp.add, between, within))
-
 
 class Window(NamedTuple):
     """The state of a fixed-lag smoother."""
@@ -190,7 +171,7 @@ class FixedLagSmoother(Checked):
         self,
         key: Key[Array, ""],
         window: Window,
-        observation: PyTree = None,
+        observation: PyTree,
         *,
         inputs: PyTree = None,
     ) -> tuple[Window, PyTree, StepInfo]:
@@ -201,9 +182,8 @@ class FixedLagSmoother(Checked):
         `inputs` are u_t.
         """
         key_step, key_draws = jax.random.split(key)
-        observation = (
-            None if observation is None else one_observation(observation, self.filter.model)
-        )
+        if observation is not None:
+            observation = one_observation(observation, self.filter.model)
         moved, info = self.filter._run(key_step, window.mixture, observation, inputs)
         inputs = one_input(inputs, self.filter.model)
         window, estimates = _advance(self, key_draws, window, moved, inputs)
@@ -220,11 +200,8 @@ class FixedLagSmoother(Checked):
 
     def _no_terms(self, states: PyTree) -> Terms:
         """Zeros for the terms of the first steps, of which there are none: (L + 1, n, ...)."""
-
-        def zeros(leaf: jax.ShapeDtypeStruct) -> Array:
-            return jnp.zeros((self.lag + 1, *leaf.shape), leaf.dtype)
-
-        terms = jax.tree.map(zeros, jax.eval_shape(self._of_states, states, states))
+        values, rows = jax.eval_shape(self._of_states, states, states), (self.lag + 1,)
+        terms = jax.tree.map(lambda leaf: jnp.zeros(rows + leaf.shape, leaf.dtype), values)
         return Terms(terms, jax.tree.map(jnp.real, terms))
 
     def _of_pasts(
@@ -240,26 +217,23 @@ class FixedLagSmoother(Checked):
         Leaves of the first are (any, n, ...) as they were, of the second (n, ...).
         """
         model = with_inputs(self.filter.model, inputs)
-        needed, start = moved.occupied, moved.ancestor_indices
+        states, needed, start = moved.particles, moved.occupied, moved.ancestor_indices
         if self.method == "exact":
-            log_kernel = log_kernel_from(model, mixture)
-            indices = draw_exactly(key, log_kernel, moved.particles, mixture, _DRAWS, needed)
+            log_kernel = backward.log_kernel_from(model, mixture)
+            indices = backward.draw_exactly(key, log_kernel, states, mixture, _DRAWS, needed)
         else:
             key_proposed, key_walk = split(key, 2)
-            proposed = draw(key_proposed, start.shape, mixture.log_weights)
-            later = walk(key_walk, model, moved.particles, mixture, start, proposed, needed)
+            proposed = backward.draw(key_proposed, start.shape, mixture.log_weights)
+            later = backward.walk(key_walk, model, states, mixture, start, proposed, needed)
             indices = jnp.stack([start, later], axis=1)  # the start counts as a draw
         places = jnp.where((moved.began_anew & needed)[:, None], -1, indices).reshape(-1)
-        earlier = rows_at(places, mixture.particles)
+        earlier = backward.rows_at(places, mixture.particles)
         repeat = partial(jnp.repeat, repeats=_DRAWS, axis=0)
-        values = self._of_states(earlier, jax.tree.map(repeat, moved.particles))
+        values = self._of_states(earlier, jax.tree.map(repeat, states))
         no_spread = jax.tree.map(lambda leaf: jnp.zeros_like(jnp.real(leaf)), values)
 
-        def of_past(term: Terms) -> Terms:
-            drawn = rows_at(places, term)
-            return _over_draws(drawn)
-
-        return jax.vmap(of_past)(terms), _over_draws(Terms(values, no_spread))
+        of_pasts = jax.vmap(lambda term: _over_draws(backward.rows_at(places, term)))(terms)
+        return of_pasts, _over_draws(Terms(values, no_spread))
 
     def _of_states(self, previous: PyTree, states: PyTree) -> PyTree:
         """h of these states; a `ValueError` unless it is one value a particle."""
@@ -271,11 +245,8 @@ class FixedLagSmoother(Checked):
 
 def _check_sums(sums: PyTree) -> None:
     """Raise a `RuntimeError` where they are NaN; within a caller's jit they stay so."""
-    leaves = jax.tree.leaves(sums)
-    if not any(isinstance(leaf, Tracer) for leaf in leaves) and any(
-        np.isnan(leaf).any() for leaf in leaves
-    ):
-        raise RuntimeError(f"function: a sum is NaN. Either {NO_TRANSITION}; or {NO_PAST}")
+    if not is_traced(sums) and any(np.isnan(leaf).any() for leaf in jax.tree.leaves(sums)):
+        raise RuntimeError(f"function: a sum is NaN. Either {backward.NO_TRANSITION}; or {NO_PAST}")
 
 
 def _over_draws(terms: Terms) -> Terms:
@@ -303,11 +274,16 @@ def _advance(smoother: Any, key: Any, window: Window, moved: ParticleMixture, in
 @jit_with_floats_traced
 def _estimates(smoother: Any, window: Window) -> Terms:
     """The moments of r = t - L, ..., t, NaN for those before the first step."""
-    num_kept = smoother.lag + 1
-    steps = window.num_steps - num_kept + jnp.arange(num_kept, dtype=window.num_steps.dtype)
+    num_kept, mixture = smoother.lag + 1, window.mixture
+    steps = window.num_steps - num_kept + jnp.arange(num_kept, dtype=jnp.int32)
 
     def of_step(r: Array) -> Terms:
-        estimates = window.terms.row(r % num_kept).estimates_in(window.mixture)
+        means, variances = jax.tree.map(lambda leaf: leaf[r % num_kept], window.terms)
+        # The variance is of the means, plus the mean of the variances.
+        between = jax.tree.map(mixture.variance, means)
+        within = jax.tree.map(mixture.expectation, variances)
+        means = jax.tree.map(mixture.expectation, means)
+        estimates = Terms(means, jax.tree.map(jnp.add, between, within))
         return jax.tree.map(lambda leaf: jnp.where(r < 0, jnp.nan, leaf), estimates)
 
     return jax.vmap(of_step)(steps)

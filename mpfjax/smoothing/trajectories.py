@@ -21,16 +21,7 @@ from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import count_places, take
 from mpfjax.running.results import FilterRun
-from mpfjax.smoothing.backward import (
-    append_last,
-    check_pasts,
-    draw,
-    draw_ends,
-    draw_exactly,
-    log_kernel_from,
-    rows_at,
-    walk,
-)
+from mpfjax.smoothing import backward
 from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
 NO_PAST = "a state that began anew steps before, as with restarts, has no past among the particles"
@@ -56,12 +47,7 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     mixtures = refuse_where(jnp.any(began_anew), mixtures, f"mixtures: {NO_PAST}")
     if not is_run:
         return mixtures
-    initial = run.initial.replace(memory={})
-    return jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None].astype(rest.dtype), rest]),
-        initial,
-        mixtures,
-    )
+    return backward.after_first(run.initial.replace(memory={}), mixtures)
 
 
 def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:
@@ -77,8 +63,7 @@ def ancestors_of(particles: Int[Array, " k"], mixtures: ParticleMixture) -> Int[
     def back(indices: Array, ancestors: Array) -> tuple[Array, Array]:
         return take(ancestors, indices), indices
 
-    parents = mixtures.ancestor_indices[1:]
-    first, later = jax.lax.scan(back, particles, parents, reverse=True)
+    first, later = jax.lax.scan(back, particles, mixtures.ancestor_indices[1:], reverse=True)
     return jnp.concatenate([first[None], later])
 
 
@@ -137,8 +122,8 @@ def _trace(mixtures: ParticleMixture) -> Genealogy:
 
     apart = jax.lax.map(num_ancestors, indices).T
     share = apart / jnp.maximum(final.component_counts, 1)[:, None]
-    share = share.astype(final.log_weights.dtype)
-    return Genealogy(indices, paths_through(mixtures, indices), share)
+    paths = paths_through(mixtures, indices)
+    return Genealogy(indices, paths, share.astype(final.log_weights.dtype))
 
 
 @checked
@@ -207,14 +192,15 @@ def sample_trajectories(
             present = present_steps(observations, series, refusal_of(model))
             observations = with_gaps(observations, present)
         check_marginalised(model, stacked, observations, method)
-        paths, indices = sample_marginalised(
-            key, model, stacked, observations, inputs, num_trajectories
-        )
+        data = observations, inputs
+        paths, indices = sample_marginalised(key, model, stacked, *data, num_trajectories)
     else:
         if method == "mcmc":
             stacked = with_parents(stacked, "sample_trajectories with method 'mcmc', not 'exact',")
         paths, indices = draw_trajectories(key, model, stacked, inputs, num_trajectories, method)
-    check_pasts(indices)
+    # Within a caller's jit there are NaN where a state has no past.
+    if not isinstance(indices, Tracer) and np.any(np.asarray(indices) < 0):
+        raise RuntimeError(backward.NO_TRANSITION)
     _warn_of_few(indices, stacked)
     return paths
 
@@ -238,20 +224,19 @@ def draw_trajectories(key, model, mixtures, inputs, num_trajectories, method):
     `inputs` are those of the steps between mixtures; indices are -1 as by `draw_exactly`.
     """
     key_final, key_steps, key_proposed = split(key, 3)
-    last, states = draw_ends(key_final, mixtures, num_trajectories)
+    last, states = backward.draw_ends(key_final, mixtures, num_trajectories)
 
     def back(carry: tuple[PyTree, Array], step: Any) -> tuple[tuple[PyTree, Array], PyTree]:
         next_states, next_indices = carry
         step_key, earlier, ancestors, proposed, now = step
         model_now = with_inputs(model, now)
         if proposed is None:
-            log_kernel = log_kernel_from(model_now, earlier)
-            draws = draw_exactly(step_key, log_kernel, next_states, earlier)
-            indices = draws[:, 0]
+            log_kernel = backward.log_kernel_from(model_now, earlier)
+            indices = backward.draw_exactly(step_key, log_kernel, next_states, earlier)[:, 0]
         else:
             start = take(ancestors, jnp.maximum(next_indices, 0))
-            indices = walk(step_key, model_now, next_states, earlier, start, proposed)
-        states = rows_at(indices, earlier.particles)
+            indices = backward.walk(step_key, model_now, next_states, earlier, start, proposed)
+        states = backward.rows_at(indices, earlier.particles)
         return (states, indices), (states, indices)
 
     num_earlier = mixtures.log_weights.shape[0] - 1
@@ -260,23 +245,22 @@ def draw_trajectories(key, model, mixtures, inputs, num_trajectories, method):
     if method == "mcmc":
         # All times in one go, since proposals do not depend on the states after them.
         keys, shape = jax.random.split(key_proposed, num_earlier), (num_trajectories,)
-        proposed = jax.vmap(lambda key, logs: draw(key, shape, logs))(keys, earlier.log_weights)
+        draw = jax.vmap(lambda key, logs: backward.draw(key, shape, logs))
+        proposed = draw(keys, earlier.log_weights)
     keys = jax.random.split(key_steps, num_earlier)
     steps = (keys, earlier, ancestors, proposed, inputs)
     _, past = jax.lax.scan(back, (states, last), steps, reverse=True)
-    states, indices = append_last(past, (states, last))
+    states, indices = backward.append_last(past, (states, last))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states), indices
 
 
-def draw_trajectory(
-    key: Key[Array, ""], model: AbstractStateSpaceModel, run: FilterRun, inputs: PyTree
-) -> PyTree:
+def draw_trajectory(key: Key[Array, ""], model: Any, run: FilterRun, inputs: PyTree) -> PyTree:
     """One trajectory of a run, leaves (t + 1, ...); from the genealogy without `log_transition`."""
     mixtures = mixtures_of(run)
     if callable(getattr(model, "log_transition", None)):
         paths, _ = draw_trajectories(key, model, mixtures, inputs, 1, "exact")
     else:
-        end = draw(key, (1,), mixtures.log_weights[-1])
+        end = backward.draw(key, (1,), mixtures.log_weights[-1])
         paths = paths_through(mixtures, ancestors_of(end, mixtures))
     return jax.tree.map(lambda leaf: leaf[0], paths)
 
@@ -314,5 +298,4 @@ def _warn_of_few(indices: Int[Array, "t k"], mixtures: ParticleMixture) -> None:
 
 def _num_distinct(rows: np.ndarray) -> np.ndarray:
     """How many numbers of each row differ."""
-    rows = np.sort(rows, axis=1)
-    return 1 + np.count_nonzero(rows[:, 1:] != rows[:, :-1], axis=1)
+    return np.array([len(np.unique(row)) for row in rows])

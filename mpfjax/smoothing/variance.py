@@ -57,11 +57,8 @@ class EveIndices(Memory):
     def of(cls, mixture: ParticleMixture) -> "EveIndices":
         """The Eve indices of x_0, where every particle is its own Eve."""
         n, m = mixture.num_particles, mixture.num_components
-        return cls(
-            indices=jnp.arange(n, dtype=jnp.int32),
-            groups=jnp.zeros(n, jnp.int32),
-            log_pair_factors=jnp.zeros((m, m), mixture.log_weights.dtype),
-        )
+        log_pair_factors = jnp.zeros((m, m), mixture.log_weights.dtype)
+        return cls(jnp.arange(n, dtype=jnp.int32), jnp.zeros(n, jnp.int32), log_pair_factors)
 
     def at_start(self, mixture: ParticleMixture) -> "EveIndices":
         """Every particle its own Eve."""
@@ -83,9 +80,7 @@ class EveIndices(Memory):
         grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)
         return EveIndices(take(self.indices, parents), groups, log_factors + jnp.diag(grown))
 
-    def after_step(
-        self, mixture: ParticleMixture, now: Any
-    ) -> tuple["EveIndices", dict[str, PyTree]]:
+    def after_step(self, mixture: ParticleMixture, now: Any) -> tuple[Memory, dict[str, PyTree]]:
         """The errors of log Ẑ and of the masses; none on islands, which families may span."""
         if num_islands() > 1:
             return self, {}
@@ -137,9 +132,8 @@ def _by_components(eve: EveIndices, mixture: ParticleMixture) -> Float[Array, "m
     """
     m = mixture.num_components
     pairs = mixture.component_indicators * m + eve.groups
-    masses = eve.family_masses(mixture.weights, pairs, m * m)
-    totals = jnp.sum(masses, axis=1).reshape(m, m)
-    masses = masses.reshape(m, m, -1)
+    masses = eve.family_masses(mixture.weights, pairs, m * m).reshape(m, m, -1)
+    totals = jnp.sum(masses, axis=2)
     largest = jnp.max(eve.log_pair_factors)
     factors = jnp.exp(eve.log_pair_factors - largest)
 
@@ -177,9 +171,9 @@ class _KeepEveIndices(AbstractMove):
 
         for part in [now, *jax.tree.leaves(moves, is_leaf=draws)]:
             for option, independent in _INDEPENDENT.items():
-                chosen, name = getattr(part, option, independent), type(part).__name__
+                chosen = getattr(part, option, independent)
                 if chosen != independent:
-                    name = "the filter" if part is now else name
+                    name = "the filter" if part is now else type(part).__name__
                     which = f"{chosen!r}, not {independent!r}"
                     raise ValueError(f"filter: {option} of {name} is {which}")
 
@@ -191,7 +185,6 @@ class _KeepEveIndices(AbstractMove):
         self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
     ) -> ParticleMixture:
         """The mixture with a memory in which every particle is its own Eve."""
-        del key, now
         return mixture.replace(memory=mixture.memory | {EVE_INDICES: EveIndices.of(mixture)})
 
 
@@ -207,9 +200,8 @@ def with_eve_indices(filter: Filter) -> Filter:
     `PropagateIndependently`, `PropagateInClusters` or `IslandInteraction`), and for draws that are
     not independent: a scheme other than "multinomial", or a noise other than "independent".
     """
-    if any(isinstance(move, _KeepEveIndices) for move in filter.initial_moves):
-        return filter
-    initial_moves = [move for move in filter.initial_moves if not move.weighs]
+    others = (move for move in filter.initial_moves if not isinstance(move, _KeepEveIndices))
+    initial_moves = [move for move in others if not move.weighs]
     return filter.replace(initial_moves=[*initial_moves, _KeepEveIndices()])
 
 
@@ -257,9 +249,8 @@ def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[
     `ValueError` for a run of a filter without Eve indices, and one of islands. Use it to choose N:
     particle Metropolis-Hastings works best with a variance of about one (Doucet et al. 2015).
     """
-    mixture = _with_lineage(run)
     degenerate = run.degenerate if isinstance(run, FilterRun) else jnp.zeros(1, bool)
-    return jnp.where(jnp.any(degenerate), jnp.inf, _evidence_variance(mixture))
+    return jnp.where(jnp.any(degenerate), jnp.inf, _evidence_variance(_with_lineage(run)))
 
 
 @checked
@@ -356,19 +347,13 @@ def batch_estimate(
     # Each run is left out in turn; a difference of sums would be lost to rounding.
     stays = jnp.concatenate([jnp.ones((1, number), bool), ~jnp.eye(number, dtype=bool)])
     log_evidences = jnp.where(stays, logs[None], -jnp.inf)
-    estimates = jax.vmap(lambda shares: jnp.tensordot(shares, values, axes=1))(
-        jax.nn.softmax(log_evidences, axis=1).astype(values.dtype)
-    )
+    shares = jax.nn.softmax(log_evidences, axis=1).astype(values.dtype)
+    estimates = jax.vmap(lambda row: jnp.tensordot(row, values, axes=1))(shares)
     number_left = jnp.sum(stays, axis=1).astype(logs.dtype)
     log_z = jax.vmap(log_sum_exp)(log_evidences) - jnp.log(number_left)
-    shares = jax.nn.softmax(logs)
-    return BatchEstimate(
-        value=estimates[0],
-        error=_jackknife(estimates[1:]),
-        log_marginal_likelihood=log_z[0],
-        log_marginal_likelihood_error=_jackknife(log_z[1:]),
-        effective_runs=1 / jnp.sum(shares**2),
-    )
+    effective_runs = 1 / jnp.sum(jax.nn.softmax(logs) ** 2)
+    errors = _jackknife(estimates[1:]), _jackknife(log_z[1:])
+    return BatchEstimate(estimates[0], errors[0], log_z[0], errors[1], effective_runs)
 
 
 def _jackknife(without: Float[Array, "b *shape"]) -> Float[Array, " *shape"]:
