@@ -84,8 +84,8 @@ def odometry_steps(
     squares, so that the same way in more steps has less noise, and an odometry that trembles at
     rest has a lot.
 
-    Raises `ValueError` for one of the two alone, and for turns of more than 2π from one pose to the
-    next, as headings in degrees make.
+    Raises `ValueError` for one of the two alone, and for headings in degrees: turns of more than 2π
+    from one pose to the next, or headings along the way only if they are in degrees.
     """
     rows = _poses_of(poses)
     if (min_distance is None) != (min_turn is None):
@@ -113,6 +113,15 @@ def _poses_of(poses: Any) -> Float[np.ndarray, "t 3"]:
     if turns.size and np.nanmax(turns) > 2 * np.pi + 0.01:
         degrees = "is more than a full turn; headings are in radians, np.deg2rad(...)"
         raise ValueError(f"poses: a turn of {np.nanmax(turns):.4g} from one to the next {degrees}")
+    # A robot drives along its heading, forwards or backwards.
+    headings, way = rows[:-1, 2], np.diff(rows[:, :2], axis=0) @ [1, 1j]
+    if np.nansum(np.abs(way)) > 0 and np.nanmax(np.abs(headings)) > 2 * np.pi:
+        along, along_degrees = (
+            np.nansum(np.real((way * np.exp(-1j * each)) ** 2)) / np.nansum(np.abs(way) ** 2)
+            for each in (headings, np.deg2rad(headings))
+        )
+        if along < 0.8 and along_degrees > 0.9:
+            raise ValueError("poses: headings that fit the way in degrees; use np.deg2rad(...)")
     return rows
 
 

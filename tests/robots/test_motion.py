@@ -31,6 +31,15 @@ def test_headings_in_degrees_are_refused(function):
         function(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 90.0]]))
 
 
+def test_a_way_along_headings_in_degrees_is_refused():
+    """Each turn is less than 2π; in radians the same way passes, however often it goes round."""
+    turns = np.linspace(0, 6 * np.pi, 600)
+    circle = np.column_stack([np.sin(turns), -np.cos(turns), turns])
+    assert len(robots.odometry_steps(circle)) == 599
+    with pytest.raises(ValueError, match="fit the way in degrees"):
+        robots.odometry_steps(circle * [1, 1, 180 / np.pi])
+
+
 def test_poses_at_the_times_of_scans():
     """Headings go the shorter way."""
     poses = np.array([[0.0, 0.0, 3.1], [1.0, 2.0, -3.1], [1.0, 4.0, -3.0]])
