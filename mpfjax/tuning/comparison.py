@@ -76,7 +76,8 @@ def compare_evidence(models: Mapping[str, Runs]) -> Comparison:
             (run,) = posteriors
             evidence[name] = run.log_marginal_likelihood, run.log_marginal_likelihood_error
             if not np.isfinite(evidence[name]).all():
-                raise ValueError(f"models: one run of {name} gives no error; give several runs")
+                how = "a larger num_samples, or several runs"
+                raise ValueError(f"models: the run of {name} has no standard error; use {how}")
             continue
         evidence[name] = _pool(name, [
             run.log_marginal_likelihood if isinstance(run, SequentialPosterior) else float(run)

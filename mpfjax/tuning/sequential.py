@@ -126,10 +126,12 @@ class SequentialPosterior:
 
     def __repr__(self) -> str:
         size = 1 / (self.weights.astype(float) ** 2).sum()
+        error = self.log_marginal_likelihood_error
+        spread = "without a standard error" if np.isnan(error) else f"± {error:.2f}"
         heading = (
             f"{len(self.weights)} samples ({size:.0f} effective) after"
             f" {len(self.log_likelihood_increments)} observations; log evidence"
-            f" {self.log_marginal_likelihood:.2f} ± {self.log_marginal_likelihood_error:.2f}"
+            f" {self.log_marginal_likelihood:.2f} {spread}"
         )
         return table(heading + (f"; {self.stopped}" if self.stopped else ""), self.summary())
 

@@ -59,7 +59,8 @@ def run_of(key, r=0.5, num_samples=600, num_steps=8):
 def test_posteriors_of_different_data_and_runs_without_an_error_are_refused():
     one, other = run_of(jax.random.key(0)), run_of(jax.random.key(0), num_samples=30)
     assert np.isnan(other.log_marginal_likelihood_error)  # of five chains
-    with pytest.raises(ValueError, match="one run of other gives no error; give several"):
+    assert "without a standard error" in repr(other)
+    with pytest.raises(ValueError, match="run of other has no standard error; use a larger"):
         compare_evidence({"one": one, "other": other})
     with pytest.raises(ValueError, match=r"of \[4, 8\] observations"):
         compare_evidence({"one": one, "short": run_of(jax.random.key(0), num_steps=4)})
