@@ -223,7 +223,7 @@ def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[st
             axis.fill_between(x, *ends, color=style["color"], alpha=0.2, lw=0)
         elif ends:
             # Shifted a little, so that intervals at the same place do not cover each other.
-            shift = index - (len(names) - 1) / 2
+            shift = list(panel.lines).index(name) - (len(panel.lines) - 1) / 2
             beside = x * 1.04**shift if scales[0] == "log" else x + 0.06 * step * shift
             axis.vlines(beside, *ends, color=style["color"], lw=style["lw"])
             axis.plot(x, y, **style)

@@ -1,8 +1,11 @@
-"""What tables 1 and 2 hang on: the size of objects, the distracter's speed, the momentum."""
+"""What tables 1 and 2 depend on: the size of objects, the distracter's speed, the momentum."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from scipy import stats
 
 from benchmarks import figures as plotting
 from benchmarks import harness
@@ -12,6 +15,7 @@ from benchmarks.partitioned_sampling.tables import content_of
 
 LAMBDA = 20.0
 FILTERS = {"joint": "joint PF", "ps": "PS, mean of orders", "dps": "DPS"}
+PAIRS = {"DPS − PS": ("dps", "ps"), "PS − joint PF": ("ps", "joint")}
 # What changes, by name and value.
 AXES: dict[str, dict[float, dict[str, Any]]] = {
     "objects' size [px]": {side: {"size": (side, side)} for side in (20, 24, 26, 28, 32)},
@@ -24,6 +28,11 @@ COLUMNS = {
     "interval of recovery": "[{recovery_interval[0]:.0%}, {recovery_interval[1]:.0%}]",
     "scenes of keys": "{scenes} of {keys_tried}",
 }  # fmt: skip
+PAIRED_COLUMNS = {
+    "what": "{axis}", "value": "{value:g}", "paired difference of recovery": "{filter}",
+    "mean": "{difference:+.0%}",
+    "interval": "[{difference_interval[0]:+.0%}, {difference_interval[1]:+.0%}]",
+}  # fmt: skip
 
 
 def run_sensitivity(
@@ -35,7 +44,8 @@ def run_sensitivity(
     than `num_scenes`, those there are; a case without any is left out, and said to be.
     """
     entries: list[dict[str, Any]] = []
-    done: dict[str, list[dict[str, Any]]] = {}
+    differences: list[dict[str, Any]] = []
+    done: dict[str, tuple[list[dict[str, Any]], list[dict[str, Any]]]] = {}
     settings = harness.settings_of({
         "lambda": LAMBDA, "num_particles": num_particles, "runs": num_runs, "seed": seed,
         "keys": [keys[0], keys[-1]],
@@ -47,18 +57,24 @@ def run_sensitivity(
             scenes = synthetic_scenes(keys, num_scenes, setting)
             done[str(setting)] = _run_case(scenes, num_particles, num_runs, seed)
         head = {"axis": axis, "value": value, "setting": setting}
-        entries += [head | entry for entry in done[str(setting)]]
-        if not done[str(setting)]:
+        of_filters, of_pairs = done[str(setting)]
+        entries += [head | entry for entry in of_filters]
+        differences += [head | entry for entry in of_pairs]
+        if not of_filters:
             print(f"{axis} {value:g}: no key to {keys[-1]} makes a scene")
-        harness.data(out / "sensitivity.json", settings=settings, entries=entries)
-    print(harness.table(COLUMNS, entries))
-    harness.figures(out, dpi=110, sensitivity=draw_sensitivity(entries))
+        content = {"entries": entries, "differences": differences}
+        harness.data(out / "sensitivity.json", settings=settings, **content)
+    print(harness.table(COLUMNS, entries), harness.table(PAIRED_COLUMNS, differences), sep="\n\n")
+    harness.figures(out, dpi=110, sensitivity=draw_sensitivity(entries, differences))
 
 
 def _run_case(
     candidates: Any, num_particles: int, num_runs: int, seed: int
-) -> list[dict[str, Any]]:
-    """Success and precision of objects 2 to 7 and recovery of object 1, for each filter."""
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Success and precision of objects 2 to 7 and recovery of object 1, for each filter.
+
+    And, for each of the `PAIRS`, the difference of their recoveries in the same scenes.
+    """
     scenes, rows, tried = [], [], 0
     for number, (_, scene) in enumerate(candidates):
         tried = number + 1
@@ -66,8 +82,9 @@ def _run_case(
             scenes.append(scene)
             rows += study(scene, number, [LAMBDA], num_particles, list(FILTERS), num_runs, seed)
     if not scenes:
-        return []
-    means = content_of(scenes, rows)["means"]
+        return [], []
+    content = content_of(scenes, rows)
+    means = content["means"]
     of_hard = {(entry["method"], entry["order"]): entry for entry in means["2"]}
     entries = []
     for easy in sorted(means["1"], key=lambda entry: list(FILTERS).index(entry["method"])):
@@ -76,27 +93,55 @@ def _run_case(
             recovery = {name: hard[name] for name in ("recovery", "recovery_interval")}
             head = {"filter": FILTERS[easy["method"]], "keys_tried": tried}
             entries.append(easy | recovery | head)
-    return entries
+    return entries, _paired(content["tables"]["2"] + content["summary"]["2"])
 
 
-def draw_sensitivity(entries: Sequence[dict[str, Any]]) -> Any:
-    """Small multiples: a column for each thing that changes, a row for each rate.
+def _paired(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mean differences of recovery over scenes, with Student's 95% intervals."""
+    recovery = {
+        method: np.array([entry["recovery"] for entry in entries
+                          if entry["method"] == method and entry["order"] in (None, "mean")])
+        for method in FILTERS
+    }  # fmt: skip
+    paired = []
+    for name, (first, second) in PAIRS.items():
+        of_scenes = recovery[first] - recovery[second]
+        mean, reach = float(of_scenes.mean()), 0.0
+        if len(of_scenes) > 1:
+            quantile = float(stats.t.ppf(0.975, len(of_scenes) - 1))
+            reach = quantile * harness.mean_and_error(of_scenes)[1]
+        ends = [mean - reach, mean + reach]
+        paired.append({"filter": name, "difference": mean, "difference_interval": ends})
+    return paired
 
-    A dotted line stands at the setting of the tables.
+
+def draw_sensitivity(
+    entries: Sequence[dict[str, Any]], differences: Sequence[dict[str, Any]]
+) -> Any:
+    """Small multiples: a column for each thing that changes, a row for each measure.
+
+    Recoveries of one scene have much in common, so that intervals are shown of their paired
+    differences only. A dotted line marks the setting of the tables.
     """
     rows = (
-        ("recovery", "recovery of object 1", (-0.03, 1.03)),
-        ("precision", "precision of objects 2-7", (-0.03, 1.03)),
+        (entries, "recovery", "recovery of object 1", (-0.03, 1.03), False),
+        (differences, "difference", "paired difference\nof recovery", None, True),
+        (entries, "precision", "precision of objects 2-7", (-0.03, 1.03), True),
     )
     chosen = {axis: value for axis, values in AXES.items() for value, changed in values.items()
               if DEFAULT | changed == DEFAULT}  # fmt: skip
 
-    def panel(name: str, rate: str, label: str, limits: tuple[float, float]) -> plotting.Panel:
-        rows = [entry for entry in entries if entry["axis"] == name]
-        ends = (lambda e, i=i: e[f"{rate}_interval"][i] for i in (0, 1))
+    def panel(
+        axis: str, source: Sequence[dict[str, Any]], rate: str, label: str, limits: Any, bars: bool
+    ) -> plotting.Panel:
+        rows = [entry for entry in source if entry["axis"] == axis]
+        ends = [lambda e, i=i: e[f"{rate}_interval"][i] for i in (0, 1) if bars]
         lines = plotting.lines_of(rows, "filter", "value", rate, *ends)
-        return plotting.Panel("", name, label, lines, limits, chosen[name])
+        return plotting.Panel("", axis, label, lines, limits, chosen[axis])
 
     shown = [name for name in chosen if any(entry["axis"] == name for entry in entries)]
     panels = [[panel(name, *row) for name in shown] for row in rows]
-    return plotting.draw_panels(panels, ("linear", "linear"))
+    figure = plotting.draw_panels(panels, ("linear", "linear"))
+    for axis in figure.axes[len(shown) : 2 * len(shown)]:
+        axis.axhline(0.0, color="0.3", lw=0.8)
+    return figure
