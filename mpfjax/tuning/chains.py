@@ -3,6 +3,7 @@
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,13 +18,7 @@ from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.running.long_runs import Checkpoint, LongRun, State
 from mpfjax.tuning.densities import RandomWalk, SamplePrior, chosen, drawn, random_walk
 from mpfjax.tuning.problem import Problem, Reals
-from mpfjax.tuning.summaries import (
-    effective_sample_size,
-    numbers_of,
-    row_of,
-    split_r_hat,
-    table,
-)
+from mpfjax.tuning.summaries import effective_sample_size, numbers_of, row_of, split_r_hat, table
 
 _MOST_DRAWS_OF_A_START = 100
 # By one call of a program; between two of them bars advance and Ctrl-C is handled.
@@ -157,10 +152,8 @@ class Sampling:
             keys = jax.random.split(again, self.num_chains)
             walk = random_walk(self.deviations, reals)
             new, now_fine, none = _start_all(kernel, keys, reals, walk)
-            if attempt:
-                states = jax.vmap(chosen)(jnp.asarray(fine), states, new.states)
-            else:
-                states = new.states
+            both = jnp.asarray(fine), states, new.states
+            states = jax.vmap(chosen)(*both) if attempt else new.states
             fine = fine | np.asarray(now_fine)
             if fine.all():
                 walk = random_walk(self.deviations, states.reals)
@@ -200,8 +193,7 @@ def _start_all(kernel, keys, reals, walk):
 
 def _all_steps(kernel: Any, key: Key[Array, ""], chains: Chains, step: Any) -> Step:
     """One step of every chain."""
-    num_chains = jax.tree.leaves(chains.states)[0].shape[0]
-    keys = jax.random.split(jax.random.fold_in(key, step), num_chains)
+    keys = jax.random.split(jax.random.fold_in(key, step), len(chains.num_invalid))
     return jax.vmap(kernel.step, in_axes=(0, 0, None))(keys, chains.states, chains.walk)
 
 
@@ -210,20 +202,16 @@ def _steps(kernel, key, chains, numbers):
     """Some steps of all chains, and their draws: one program for any number of steps."""
     first, last, burn_in = numbers
     report = eqx.filter_eval_shape(_all_steps, kernel, key, chains, 0).report
-    buffers = jax.tree.map(
-        lambda leaf: jnp.zeros((_STEPS_AT_ONCE, *leaf.shape), leaf.dtype), report
-    )
+    rows = (_STEPS_AT_ONCE,)
+    buffers = jax.tree.map(lambda leaf: jnp.zeros(rows + leaf.shape, leaf.dtype), report)
 
     def advance(step: Array, carry: tuple[Chains, PyTree]) -> tuple[Chains, PyTree]:
         chains, buffers = carry
         steps = _all_steps(kernel, key, chains, step)
         points = jax.vmap(lambda reals: ravel_pytree(reals)[0])(steps.state.reals)
         acceptance = jnp.mean(steps.acceptance) if kernel.learns_scale else None
-        walk = jax.lax.cond(
-            step < burn_in,
-            lambda: chains.walk.adapted(points, step, acceptance),
-            lambda: chains.walk,
-        )
+        adapted = partial(chains.walk.adapted, points, step, acceptance)
+        walk = jax.lax.cond(step < burn_in, adapted, lambda: chains.walk)
         # In the burn-in, in the row of the first draw, which overwrites it.
         row = jnp.maximum(step - jnp.maximum(first, burn_in), 0)
         buffers = jax.tree.map(lambda rows, leaf: rows.at[row].set(leaf), buffers, steps.report)

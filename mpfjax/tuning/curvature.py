@@ -89,11 +89,8 @@ def standard_errors(
     _warn_of_noise(informations, covariance)
     # By the Jacobian of the parameters on their own scale, laid out in the same order.
     _, shaped = ravel_pytree(problem.constrain(reals))
-
-    def constrain(flat: Float[Array, " d"]) -> Float[Array, " d"]:
-        return ravel_pytree(problem.constrain(unravel(flat)))[0]
-
-    jacobian = np.asarray(jax.jacfwd(constrain)(point), float)
+    slope = jax.jacfwd(lambda flat: ravel_pytree(problem.constrain(unravel(flat)))[0])
+    jacobian = np.asarray(slope(point), float)
     variances = np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)
     return jax.tree.map(np.asarray, shaped(jnp.asarray(np.sqrt(variances), point.dtype)))
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.arrays import POSITIVE
 from mpfjax.checks import checked, saying, shown
@@ -39,12 +39,9 @@ class Prior(eqx.Module):
 
     def __call__(self, reals: Reals) -> Float[Array, ""]:
         """The log density, up to the constant that the function leaves out."""
-        density = jnp.asarray(
-            self.function({name: self.transforms[name].constrain(u) for name, u in reals.items()})
-        )
-        for name, u in reals.items():
-            density += self.transforms[name].log_jacobian(u)
-        return density
+        values = {name: self.transforms[name].constrain(u) for name, u in reals.items()}
+        volumes = (self.transforms[name].log_jacobian(u) for name, u in reals.items())
+        return sum(volumes, jnp.asarray(self.function(values)))
 
 
 class Point(eqx.Module):
@@ -62,9 +59,11 @@ class Point(eqx.Module):
         return self.log_prior + self.log_likelihood
 
 
-def evaluated(
-    reals: Reals, log_prior: Float[Array, ""], log_likelihood: Float[Array, ""]
-) -> tuple[Point, Bool[Array, ""]]:
+Evaluated = tuple[Point, Bool[Array, ""]]
+"""A point, and whether one of its log densities was NaN or +inf."""
+
+
+def evaluated(reals: Reals, log_prior: Array, log_likelihood: Array) -> Evaluated:
     """The point with these log densities, and whether one of them was NaN or +inf."""
     # Where the prior is zero, the likelihood may not even be defined.
     has_prior = (log_prior > -jnp.inf) & (log_prior < jnp.inf)
@@ -87,7 +86,7 @@ class LogDensity(eqx.Module):
         """The log density up to a constant; -inf where a part of it is NaN or +inf."""
         return self.evaluated(key, reals)[0].log_density
 
-    def evaluated(self, key: Key[Array, ""], reals: Reals) -> tuple[Point, Bool[Array, ""]]:
+    def evaluated(self, key: Key[Array, ""], reals: Reals) -> Evaluated:
         """Its two parts, and whether one of them is no number."""
         point, invalid = evaluated(reals, self.prior(reals), self.problem.value(key, reals))
         return dataclasses.replace(point, key_data=jax.random.key_data(key)), invalid
@@ -226,10 +225,7 @@ class RandomWalk(eqx.Module):
     log_scale: Float[Array, ""]
 
     def adapted(
-        self,
-        points: Float[Array, "chains d"],
-        step: Int[Array, ""],
-        acceptance: Float[Array, ""] | None,
+        self, points: Float[Array, "chains d"], step: Array, acceptance: Float[Array, ""] | None
     ) -> "RandomWalk":
         """The walk after one more point of each chain.
 
@@ -247,8 +243,7 @@ class RandomWalk(eqx.Module):
             # The share of steps that the best random walk accepts.
             best = 0.44 if points.shape[1] == 1 else 0.234
             log_scale = log_scale + gain * (acceptance - best)
-        factor = jnp.exp(log_scale) * factor_of(covariance)
-        return RandomWalk(factor, mean, covariance, log_scale)
+        return RandomWalk(jnp.exp(log_scale) * factor_of(covariance), mean, covariance, log_scale)
 
 
 def random_walk(deviations: Reals, starts: Reals) -> RandomWalk:
@@ -269,7 +264,7 @@ def metropolis_step(
     key: Key[Array, ""],
     factor: Float[Array, "d d"],
     point: Point,
-    evaluate: Callable[[Key[Array, ""], Reals], tuple[Point, Bool[Array, ""]]],
+    evaluate: Callable[[Key[Array, ""], Reals], Evaluated],
 ) -> tuple[Point, Bool[Array, ""], Bool[Array, ""]]:
     """A step of the walk u + F z, accepted or not.
 

@@ -20,15 +20,11 @@ from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.trajectories import draw_trajectories, mixtures_of
 from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, places_of, pose
 
-UnbiasedFilter = Annotated[
-    Filter,
-    Rule(
-        lambda value: isinstance(value, Filter) and not value.approximate,
-        "a filter with an unbiased likelihood: none of its moves is approximate",
-    ),
-]
-
-
+_IS_UNBIASED = Rule(
+    lambda value: isinstance(value, Filter) and not value.approximate,
+    "a filter with an unbiased likelihood: none of its moves is approximate",
+)
+UnbiasedFilter = Annotated[Filter, _IS_UNBIASED]
 Score = Literal["filter", "fisher"]
 _BY_FISHER = 'score="fisher"'
 _NUM_PATHS = 8  # of each run: then noise in which run is weighted how is as large as theirs
@@ -43,8 +39,7 @@ class LogEvidence(eqx.Module):
 
     def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, " series"]:
         """log Ẑ of one run for each sequence."""
-        runs = self.runs(key, filter)
-        return jnp.concatenate([run.log_marginal_likelihood for run in runs])
+        return jnp.concatenate([run.log_marginal_likelihood for run in self.runs(key, filter)])
 
     def parts(self, size: int, rng: np.random.Generator | None = None) -> list["LogEvidence"]:
         """The evidence of all sequences in parts of one group and at most this size.
@@ -65,10 +60,8 @@ class LogEvidence(eqx.Module):
         def run(key: Key[Array, ""], series: Series) -> FilterRun:
             return scan(key, filter, series, collect)
 
-        return [
-            jax.vmap(run)(jax.random.split(jax.random.fold_in(key, g), group.length), group)
-            for g, group in enumerate(self.groups)
-        ]
+        pairs = ((jax.random.fold_in(key, g), group) for g, group in enumerate(self.groups))
+        return [jax.vmap(run)(jax.random.split(key, group.length), group) for key, group in pairs]
 
 
 class LogJoint(eqx.Module):
@@ -107,14 +100,12 @@ class FisherEvidence(LogEvidence):
 
     def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, " series"]:
         """log Ẑ of one run for each sequence."""
-        fixed = jax.tree.map(
-            lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, filter
-        )
+        floats, rest = eqx.partition(filter, eqx.is_inexact_array)
+        fixed = eqx.combine(jax.lax.stop_gradient(floats), rest)
 
         def log_joint(key: Key[Array, ""], run: FilterRun, series: Series) -> Float[Array, ""]:
-            paths, _ = draw_trajectories(
-                key, fixed.model, mixtures_of(run), series.inputs, _NUM_PATHS, "mcmc"
-            )
+            about = fixed.model, mixtures_of(run), series.inputs
+            paths, _ = draw_trajectories(key, *about, _NUM_PATHS, "mcmc")
             return jnp.mean(jax.vmap(LogJoint(series), (0, None))(paths, filter))
 
         values, key_runs = [], jax.random.fold_in(key, len(self.groups))
@@ -158,8 +149,7 @@ def pose_evidence(
         stacked.append(jax.tree.map(lambda *leaves: jnp.stack(leaves), *group))
         places += numbers
     evidence = {"filter": LogEvidence, "fisher": FisherEvidence}[score]
-    objective = evidence(stacked, tuple(places))
-    problem = pose(filter, objective, parameters, transforms)
+    problem = pose(filter, evidence(stacked, tuple(places)), parameters, transforms)
     if score == "fisher" and len(names_but_proposals(problem)) < len(problem.tuned):
         raise ValueError('score: "fisher" has no derivative in parameters of a proposal')
     return problem

@@ -17,21 +17,8 @@ from mpfjax.running.long_runs import Checkpoint
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.conditional import check_conditional, possible_times, renew
 from mpfjax.smoothing.trajectories import draw_trajectory
+from mpfjax.tuning import densities
 from mpfjax.tuning.chains import AbstractKernel, PosteriorOfChains, Sampling, Step
-from mpfjax.tuning.densities import (
-    LogDensity,
-    LogPrior,
-    Point,
-    Prior,
-    RandomWalk,
-    SamplePrior,
-    checked_deviations,
-    checked_prior,
-    chosen,
-    evaluated,
-    is_invalid,
-    metropolis_step,
-)
 from mpfjax.tuning.evidence import LogJoint, UnbiasedFilter, one_sequence, pose_evidence
 from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms, pose
 
@@ -55,12 +42,12 @@ def metropolis_hastings(
     observations: PyTree,
     num_steps: Count,
     *,
-    log_prior: LogPrior,
+    log_prior: densities.LogPrior,
     proposal_deviations: float | Mapping[str, Any] = 0.1,
     parameters: Parameters = None,
     transforms: Transforms = None,
     num_chains: Count = 1,
-    sample_prior: SamplePrior | None = None,
+    sample_prior: densities.SamplePrior | None = None,
     burn_in: CountOrZero = 0,
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
@@ -109,12 +96,13 @@ def metropolis_hastings(
     `RuntimeError` if the initial values, or a hundred draws of the prior, have zero likelihood.
     """
     problem = pose_evidence(filter, observations, parameters, transforms)
-    deviations = checked_deviations(proposal_deviations, problem.start())
+    deviations = densities.checked_deviations(proposal_deviations, problem.start())
     sampling = Sampling(
         "metropolis_hastings", key, problem, deviations, num_steps, num_chains, sample_prior,
         burn_in, checkpoint, progress,
     )  # fmt: skip
-    density = LogDensity(problem, checked_prior(log_prior, problem, key, sample_prior))
+    prior = densities.checked_prior(log_prior, problem, key, sample_prior)
+    density = densities.LogDensity(problem, prior)
     (values, accepted, key_data), fields = sampling.run(_MetropolisHastings(density))
     return Posterior(
         log_marginal_likelihoods=values, accepted=accepted, key_data=key_data, **fields
@@ -127,17 +115,17 @@ class _MetropolisHastings(AbstractKernel):
     It learns no scale: noise in log Ẑ rejects steps of any length.
     """
 
-    density: LogDensity
+    density: densities.LogDensity
 
-    def start(self, key: Key[Array, ""], reals: Reals) -> tuple[Point, Bool[Array, ""]]:
+    def start(self, key: Key[Array, ""], reals: Reals) -> densities.Evaluated:
         """The pair, and whether its density is positive."""
         point, _ = self.density.evaluated(key, reals)
         return point, point.log_density > -jnp.inf
 
-    def step(self, key: Key[Array, ""], state: Point, walk: RandomWalk) -> Step:
+    def step(self, key: Key[Array, ""], state: densities.Point, walk: densities.RandomWalk) -> Step:
         """A Gaussian step in u with a fresh key, accepted or not."""
         evaluate = self.density.evaluated
-        point, accepted, invalid = metropolis_step(key, walk.factor, state, evaluate)
+        point, accepted, invalid = densities.metropolis_step(key, walk.factor, state, evaluate)
         report = (point.reals, point.log_likelihood, accepted, point.key_data)
         acceptance = accepted.astype(point.log_prior.dtype)
         return Step(point, report, acceptance, invalid.astype(jnp.int32))
@@ -165,12 +153,12 @@ def particle_gibbs(
     observations: PyTree,
     num_steps: Count,
     *,
-    log_prior: LogPrior,
+    log_prior: densities.LogPrior,
     proposal_deviations: float | Mapping[str, Any] = 0.1,
     parameters: Parameters = None,
     transforms: Transforms = None,
     num_chains: Count = 1,
-    sample_prior: SamplePrior | None = None,
+    sample_prior: densities.SamplePrior | None = None,
     burn_in: CountOrZero = 0,
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
@@ -209,15 +197,14 @@ def particle_gibbs(
     """
     check_conditional(filter, "particle_gibbs")
     require(filter.model, "log_initial", "particle_gibbs")
-    problem = pose(
-        filter, LogJoint(one_sequence(observations, filter.model)), parameters, transforms
-    )
-    deviations = checked_deviations(proposal_deviations, problem.start())
+    joint = LogJoint(one_sequence(observations, filter.model))
+    problem = pose(filter, joint, parameters, transforms)
+    deviations = densities.checked_deviations(proposal_deviations, problem.start())
     sampling = Sampling(
         "particle_gibbs", key, problem, deviations, num_steps, num_chains, sample_prior, burn_in,
         checkpoint, progress,
     )  # fmt: skip
-    kernel = _Gibbs(problem, checked_prior(log_prior, problem, key, sample_prior))
+    kernel = _Gibbs(problem, densities.checked_prior(log_prior, problem, key, sample_prior))
     (paths, accepted, renewed), fields = sampling.run(kernel)
     return GibbsPosterior(trajectories=paths, accepted=accepted, renewed=renewed, **fields)
 
@@ -236,7 +223,7 @@ class _Gibbs(AbstractKernel):
     """
 
     problem: Problem
-    prior: Prior
+    prior: densities.Prior
 
     learns_scale = True
 
@@ -251,40 +238,38 @@ class _Gibbs(AbstractKernel):
         fine &= jnp.all(possible_times(filter.model, path, series.inputs))
         return _Pair(reals, path), fine
 
-    def step(self, key: Key[Array, ""], state: _Pair, walk: RandomWalk) -> Step:
+    def step(self, key: Key[Array, ""], state: _Pair, walk: densities.RandomWalk) -> Step:
         """The next pair."""
         key_parameters, key_trajectory = jax.random.split(key)
         reals, accepted, num_invalid = self._metropolis(key_parameters, state, walk)
         filter, series = self.problem.at(reals), self.problem.objective.series
         result = renew(key_trajectory, filter, series, state.trajectory)
         possible = possible_times(filter.model, result.trajectory, series.inputs)
-        broken = jnp.any(is_invalid(result.run.log_likelihood_increments))
+        broken = jnp.any(densities.is_invalid(result.run.log_likelihood_increments))
         broken |= ~jnp.all(result.possible & possible)
-        pair = chosen(~broken, _Pair(reals, result.trajectory), state)
+        pair = densities.chosen(~broken, _Pair(reals, result.trajectory), state)
 
         def changed(new: Array, old: Array) -> Bool[Array, " times"]:
             return jnp.any((new != old).reshape(new.shape[0], -1), axis=1)
 
         changes = jax.tree.leaves(jax.tree.map(changed, pair.trajectory, state.trajectory))
-        renewed = jnp.any(jnp.stack(changes), axis=0)
-        report = (pair.reals, pair.trajectory, accepted, renewed)
+        report = (pair.reals, pair.trajectory, accepted, jnp.any(jnp.stack(changes), axis=0))
         return Step(pair, report, accepted, num_invalid + broken.astype(jnp.int32))
 
     def _metropolis(
-        self, key: Key[Array, ""], state: _Pair, walk: RandomWalk
+        self, key: Key[Array, ""], state: _Pair, walk: densities.RandomWalk
     ) -> tuple[Reals, Float[Array, ""], Int[Array, ""]]:
         """Steps of the random walk on the parameters given the trajectory.
 
         Also the share that is accepted, and how often a density was no number.
         """
 
-        def evaluate(key: Key[Array, ""], reals: Reals) -> tuple[Point, Bool[Array, ""]]:
-            del key
+        def evaluate(key: Key[Array, ""], reals: Reals) -> densities.Evaluated:
             log_joint = self.problem.objective(state.trajectory, self.problem.at(reals))
-            return evaluated(reals, self.prior(reals), log_joint)
+            return densities.evaluated(reals, self.prior(reals), log_joint)
 
-        def move(point: Point, key: Key[Array, ""]) -> tuple[Point, Any]:
-            point, *report = metropolis_step(key, walk.factor, point, evaluate)
+        def move(point: densities.Point, key: Key[Array, ""]) -> tuple[densities.Point, Any]:
+            point, *report = densities.metropolis_step(key, walk.factor, point, evaluate)
             return point, report
 
         keys = jax.random.split(key, _NUM_METROPOLIS_STEPS)

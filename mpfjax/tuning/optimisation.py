@@ -25,13 +25,11 @@ from mpfjax.tuning.problem import (
     scores,
 )
 
-Optimizer = Annotated[
-    optax.GradientTransformation,
-    Rule(
-        lambda value: not isinstance(value, type) and callable(getattr(value, "update", None)),
-        "an optimiser of optax, as optax.adam(0.05)",
-    ),
-]
+_IS_OPTIMIZER = Rule(
+    lambda value: not isinstance(value, type) and callable(getattr(value, "update", None)),
+    "an optimiser of optax, as optax.adam(0.05)",
+)
+Optimizer = Annotated[optax.GradientTransformation, _IS_OPTIMIZER]
 
 # Where fewer seeds than this count, the bias of log Ẑ is large and unknown.
 _FEWEST_SEEDS = 2.0
@@ -131,9 +129,8 @@ def fit(
     warn_of_bias("fit", problem)
     if pooled is None:
         pooled = bool(names_but_proposals(problem))
-    ascent = _Ascent(
-        "fit", "log marginal likelihood", key, problem, optimizer, num_seeds, batch, pooled
-    )
+    what = "fit", "log marginal likelihood"
+    ascent = _Ascent(*what, key, problem, optimizer, num_seeds, batch, pooled)
     data = {"observations": problem.objective, "score": score}
     values, run = ascent.climb(num_steps, checkpoint, progress, data)
     if values is None:
@@ -284,19 +281,12 @@ class _Ascent:
         if step == 0 and idle:
             what = f"the {self.objective} does not depend on {', '.join(idle)}"
             raise ValueError(f"parameters: {what}")
-        gradient = jax.tree.map(lambda leaf: factor * leaf, gradient)
-        updated, optimizer = self._update(gradient, optimizer, reals)
-        deviation = np.sqrt(factor) * values.sum(axis=1).std()
-        effective = _effective_seeds(values).mean()
-        row = factor * self._average(values), deviation, effective, reals
-        row = jax.tree.map(lambda leaf: np.asarray(leaf)[None], row)
-        return step + 1, (updated, optimizer), row
-
-    def _update(self, gradient: Reals, optimizer: PyTree, reals: Reals) -> tuple[Reals, PyTree]:
-        """One step of the optimiser."""
-        descent = jax.tree.map(jnp.negative, gradient)
+        descent = jax.tree.map(lambda leaf: -factor * leaf, gradient)
         # Optimisers need JAX's default promotion, whatever the caller has set.
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
             updates, optimizer = self.optimizer.update(descent, optimizer, reals)
-            moved: Any = optax.apply_updates(reals, updates)
-        return moved, optimizer
+            moved = optax.apply_updates(reals, updates)
+        deviation = np.sqrt(factor) * values.sum(axis=1).std()
+        row = factor * self._average(values), deviation, _effective_seeds(values).mean(), reals
+        row = jax.tree.map(lambda leaf: np.asarray(leaf)[None], row)
+        return step + 1, (moved, optimizer), row

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture, single_component
@@ -17,15 +17,7 @@ from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.logarithms import log_sum_exp
 from mpfjax.running.scan import first_mixture, step_or_predict
-from mpfjax.tuning.densities import (
-    Point,
-    Prior,
-    evaluated,
-    factor_of,
-    is_invalid,
-    metropolis_step,
-    number_or_zero,
-)
+from mpfjax.tuning import densities
 from mpfjax.tuning.problem import Problem, Reals
 
 
@@ -35,12 +27,12 @@ class Sampler(eqx.Module):
     problem: Problem
     # The data there are, and whatever comes after them up to a length that programs share.
     series: Series
-    prior: Prior
+    prior: densities.Prior
     num_moves: int = eqx.field(static=True)
 
     def run_again(
         self, key: Key[Array, ""], reals: Reals, num_steps: Int[Array, ""]
-    ) -> tuple[Point, Bool[Array, ""]]:
+    ) -> densities.Evaluated:
         """A θ with a new filter over all observations so far, and whether a density was no number.
 
         One compiled program does for any number of them.
@@ -56,7 +48,7 @@ class Sampler(eqx.Module):
         start = first_mixture(key_start, filter, self.series)
         nothing = jnp.zeros((), start.log_weights.dtype)
         mixture, log_evidence = jax.lax.fori_loop(0, num_steps, advance, (start, nothing))
-        point, invalid = evaluated(reals, self.prior(reals), log_evidence)
+        point, invalid = densities.evaluated(reals, self.prior(reals), log_evidence)
         return dataclasses.replace(point, mixture=mixture), invalid
 
     def step(
@@ -72,10 +64,11 @@ class Sampler(eqx.Module):
 def start(keys, sampler, reals):
     """Each θ with the mixture of x_0, as particles of equal weight in one component."""
 
-    def one(key: Key[Array, ""], reals: Reals) -> Point:
+    def one(key: Key[Array, ""], reals: Reals) -> densities.Point:
         mixture = first_mixture(key, sampler.problem.at(reals), sampler.series)
         nothing = jnp.zeros((), mixture.log_weights.dtype)
-        return Point(reals, number_or_zero(sampler.prior(reals)), nothing, mixture)
+        log_prior = densities.number_or_zero(sampler.prior(reals))
+        return densities.Point(reals, log_prior, nothing, mixture)
 
     return single_component(jax.vmap(one)(keys, reals))
 
@@ -88,13 +81,15 @@ def extend(key, sampler, samples, t):
     increment (-inf where all are zero), the effective sample size, and how many were dropped.
     """
 
-    def one(key: Key[Array, ""], sample: Point) -> tuple[ParticleMixture, Float[Array, ""]]:
+    def one(
+        key: Key[Array, ""], sample: densities.Point
+    ) -> tuple[ParticleMixture, Float[Array, ""]]:
         return sampler.step(key, sampler.problem.at(sample.reals), sample.mixture, t)
 
     points, alive = samples.particles, samples.log_weights > -jnp.inf
     mixtures, increments = jax.vmap(one)(jax.random.split(key, samples.num_particles), points)
-    num_invalid = jnp.sum(alive & is_invalid(increments), dtype=jnp.int32)
-    increments = number_or_zero(increments)
+    num_invalid = jnp.sum(alive & densities.is_invalid(increments), dtype=jnp.int32)
+    increments = densities.number_or_zero(increments)
     log_likelihood = points.log_likelihood + increments
     points = dataclasses.replace(points, mixture=mixtures, log_likelihood=log_likelihood)
     log_weights = jnp.where(alive, samples.log_weights + increments, -jnp.inf)
@@ -113,7 +108,7 @@ def rejuvenate(key, sampler, samples, num_steps):
     key_resample, key_moves = jax.random.split(key)
     points = jax.vmap(lambda reals: ravel_pytree(reals)[0])(samples.particles.reals)
     centred = points - samples.expectation(points)[None]
-    factor = factor_of(samples.expectation(centred[:, :, None] * centred[:, None, :]))
+    factor = densities.factor_of(samples.expectation(centred[:, :, None] * centred[:, None, :]))
     num_moves = sampler.num_moves
     num_chains = samples.num_particles // (num_moves + 1)
     # Multinomial, whose families say how large the error of the evidence is.
@@ -123,9 +118,9 @@ def rejuvenate(key, sampler, samples, num_steps):
 
     evaluate = partial(sampler.run_again, num_steps=num_steps)
 
-    def chain(key: Key[Array, ""], sample: Point) -> tuple[Point, Any]:
-        def advance(sample: Point, key: Key[Array, ""]) -> tuple[Point, Any]:
-            moved = metropolis_step(key, factor, sample, evaluate)
+    def chain(key: Key[Array, ""], sample: densities.Point) -> tuple[densities.Point, Any]:
+        def advance(sample: densities.Point, key: Key[Array, ""]) -> tuple[densities.Point, Any]:
+            moved = densities.metropolis_step(key, factor, sample, evaluate)
             return moved[0], moved
 
         return jax.lax.scan(advance, sample, jax.random.split(key, num_moves))

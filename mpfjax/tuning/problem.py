@@ -156,13 +156,8 @@ def pose(
     transforms = {} if transforms is None else transforms
     for name in transforms.keys() - tuned.keys():
         raise ValueError(f"transforms: {name} is not among the parameters, {sorted(tuned)}")
-    return Problem(
-        leaves=leaves,
-        transforms={name: transforms.get(name, Unconstrained()) for name in tuned},
-        objective=objective,
-        tuned=tuple(tuned.items()),
-        structure=structure,
-    )
+    transforms = {name: transforms.get(name, Unconstrained()) for name in tuned}
+    return Problem(leaves, transforms, objective, tuple(tuned.items()), structure)
 
 
 @dataclass(frozen=True)

@@ -241,13 +241,11 @@ class _Run:
     def followed_by(self, step: int, observations: PyTree, progress: bool) -> "_Run":
         """The run with the observations that come after a step, and no others."""
         before = jax.tree.map(lambda leaf: leaf[:step], self.series)
-        after = jax.tree.map(
-            np.asarray, one_sequence(observations, self.sampler.problem.tree.model)
-        )
+        model = self.sampler.problem.tree.model
+        after = jax.tree.map(np.asarray, one_sequence(observations, model))
         if (before.present is None) != (after.present is None):
             before, after = with_present(before), with_present(after)
-        ends = jax.tree.map(lambda leaf: leaf[-1], [before, after])
-        there, here = map(kinds, ends)
+        there, here = map(kinds, jax.tree.map(lambda leaf: leaf[-1], [before, after]))
         if there != here:
             raise ValueError(f"observations: {here} is not like those before, {there}")
         series = jax.tree.map(lambda *leaves: np.concatenate(leaves), before, after)
@@ -269,14 +267,11 @@ class _Run:
         state, stopped = run.go(start, self._advance)
         samples, _, num_invalid = state.carry
         warn_of_invalid("smc2", num_invalid - start.carry[-1])
+        parameters = self.sampler.problem.constrained_rows(samples.particles.reals)
         return SequentialPosterior(
-            self.sampler.problem.constrained_rows(samples.particles.reals),
-            np.asarray(samples.log_weights),
-            *state.rows,
-            num_invalid=num_invalid,
-            stopped=stopped,
-            _end=(self, state),
-        )
+            parameters, np.asarray(samples.log_weights), *state.rows,
+            num_invalid=num_invalid, stopped=stopped, _end=(self, state),
+        )  # fmt: skip
 
     def _advance(self, step: int, last: int, carry: PyTree) -> tuple[int, PyTree, PyTree]:
         """The samples after one more observation."""
@@ -299,8 +294,5 @@ class _Run:
 
 def _pad(series: Series, capacity: int) -> Series:
     """The data in arrays of JAX with room for this many steps."""
-
-    def pad(leaf: np.ndarray) -> Array:
-        return jnp.asarray(np.resize(leaf, (capacity, *leaf.shape[1:])))
-
-    return jax.tree.map(pad, series)
+    padded = jax.tree.map(lambda leaf: np.resize(leaf, (capacity, *leaf.shape[1:])), series)
+    return jax.tree.map(jnp.asarray, padded)

@@ -63,9 +63,7 @@ def row_of(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"] | N
     return {name: float(value) for name, value in row.items()}
 
 
-def numbers_of(
-    parameters: Mapping[str, np.ndarray], num_axes: int
-) -> dict[str, Float[np.ndarray, "..."]]:
+def numbers_of(parameters: Mapping[str, np.ndarray], num_axes: int) -> dict[str, np.ndarray]:
     """Every number of the parameters by name, as a[0, 1], over the first axes alone."""
     numbers = {}
     for name, values in parameters.items():

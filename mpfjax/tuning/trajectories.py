@@ -165,8 +165,8 @@ def states_of(
     _, first, place = np.unique(flat, axis=0, return_index=True, return_inverse=True)
     rows = _rows_of(jax.tree.map(_in_one_row, values), first)
     keys = jax.random.wrap_key_data(jnp.asarray(flat[first]), impl=jax.random.key_impl(key))
-    keys_states = jax.random.split(key, len(first))
-    paths, _ = _run_again(problem, evidence, (keys_states, rows, keys), whole)
+    rows = jax.random.split(key, len(first)), rows, keys
+    paths, _ = _run_again(problem, evidence, rows, whole)
     return problem, series, values, _rows_of(paths, place.reshape(shape))
 
 
@@ -200,22 +200,20 @@ def _run_again(
 
     Rows are a key, parameters, and the key of the run.
     """
-    filter, length = problem.tree, evidence.groups[0].observations
-    length = jax.tree.leaves(length)[0].shape[1] + 1
-    size = _TOGETHER
+    filter, size = problem.tree, _TOGETHER
     if whole:
         refuse_marginalised(filter.model, _METHOD, "sample_trajectories takes it")
         if not callable(getattr(filter.model, "log_transition", None)):
             check_keep_parents("posterior", filter.moves, f"{_METHOD} without log_transition")
+        length = jax.tree.leaves(evidence.groups[0].observations)[0].shape[1] + 1
         path = jax.tree.leaves(shape_of_trajectory(filter.model, length))
         each = sum(leaf.size * leaf.dtype.itemsize for leaf in path) + 16 * length
         size = int(np.clip(_MOST_BYTES // (each * filter.num_particles), 1, _TOGETHER))
     # Whole batches, so that one program does for any number of rows: compiling takes the time.
-    number, parts = rows[0].shape[0], []
-    for first in range(0, number, size):
-        batch = _rows_of(rows, np.arange(first, first + size) % number)
-        parts.append(_in_numpy(_runs_again(problem, evidence, batch, whole)))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *parts)
+    number = rows[0].shape[0]
+    batches = (np.arange(first, first + size) % number for first in range(0, number, size))
+    runs = (_runs_again(problem, evidence, _rows_of(rows, batch), whole) for batch in batches)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *map(_in_numpy, runs))
 
 
 @jit_on_wide_vectors
@@ -228,11 +226,9 @@ def _runs_again(problem, evidence, rows, whole):
         filter = problem.having(values)
         (runs,) = evidence.runs(key_run, filter, whole)
         run = jax.tree.map(lambda leaf: leaf[0], runs)
-        if whole:
-            states = draw_trajectory(key, filter.model, run, inputs)
-        else:
-            states = _one_of(key, run.final)
-        return states, run.log_marginal_likelihood
+        if not whole:
+            return _one_of(key, run.final), run.log_marginal_likelihood
+        return draw_trajectory(key, filter.model, run, inputs), run.log_marginal_likelihood
 
     return jax.vmap(one)(rows)
 
