@@ -12,16 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import checked, warn
-from mpfjax.models.base import (
-    AbstractStateSpaceModel,
-    asking,
-    check_states,
-    is_made_of_noise,
-    model_name,
-    real_each,
-    require_noise,
-    with_inputs,
-)
+from mpfjax.models import base
 from mpfjax.models.conditionally_linear import is_mixed
 from mpfjax.models.law import law_of
 from mpfjax.models.observations import one_input, one_observation
@@ -52,7 +43,7 @@ def _jit(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
 @checked
 def check_model(
     key: Key[Array, ""],
-    model: AbstractStateSpaceModel,
+    model: base.AbstractStateSpaceModel,
     observation: PyTree,
     *,
     inputs: PyTree = None,
@@ -85,12 +76,12 @@ def check_model(
     missing.
     """
     inputs, observation = one_input(inputs, model), one_observation(observation)
-    if is_made_of_noise(model):
-        require_noise(model, "check_model")
+    if base.is_made_of_noise(model):
+        base.require_noise(model, "check_model")
     for fault in _faults(key, model, observation, inputs):
-        raise ValueError(f"model: {model_name(model)}.{fault}")
+        raise ValueError(f"model: {base.model_name(model)}.{fault}")
     if proposal is not None:
-        now = Step(with_inputs(model, inputs), observation, inputs=inputs, initial_model=model)
+        now = Step(base.with_inputs(model, inputs), observation, inputs=inputs, initial_model=model)
         proposal.check(now)
         for fault in _of_density("propose", "its draws", *_of_proposal(key, now, proposal)):
             raise ValueError(f"proposal: {type(proposal).__name__}.{fault}")
@@ -98,7 +89,7 @@ def check_model(
 
 def _faults(key: Key[Array, ""], model: Any, observation: PyTree, inputs: PyTree) -> Iterator[str]:
     """What is wrong with the model's methods, one after the other, by their names."""
-    now = with_inputs(model, inputs)
+    now = base.with_inputs(model, inputs)
     drawn = _draw(key, model, now)
     yield from _of_draws("sample_initial", drawn["many x_0"])
     if "log_initial" in drawn:
@@ -132,8 +123,7 @@ def _draw(key, model, now):
     starts = _rows(initial, slice(_FAMILIES))
     places = _repeat(_rows(starts, slice(_PLACES)), _DRAWS)
     drawn["many x_1"] = _of_many_keys(_move, keys[2], now, places)
-    far = _rows(initial, slice(_FAMILIES * _SIBLINGS))
-    groups = [far, _repeat(starts, _SIBLINGS)]
+    groups = [_rows(initial, slice(_FAMILIES * _SIBLINGS)), _repeat(starts, _SIBLINGS)]
     has_density = is_mixed(model) or callable(getattr(model, "log_transition", None))
     if has_density:
         groups.append(_repeat(_rows(starts, slice(_PLACES)), _DENSITY_DRAWS))
@@ -144,18 +134,15 @@ def _draw(key, model, now):
     siblings = drawn["siblings"] = _rows(families, slice(_FAMILIES, None))
     if has_density:
         children = law.part(_move(keys[4], now, _side_by_side(siblings)))
-        at_places = slice(2 * number, None)
-        drawn["x_1 of places"] = law.part(_rows(after, at_places))
-        drawn["log_transition"] = law.log_transition(
-            drawn["x_1 of places"], _rows(before, at_places)
-        )
+        starts, ends = (_rows(each, slice(2 * number, None)) for each in (before, after))
+        drawn["x_1 of places"] = ends = law.part(ends)
+        drawn["log_transition"] = law.log_transition(ends, starts)
 
         def log_transition(draw: PyTree, states: PyTree) -> Float[Array, " s"]:
             return law.log_transition(_repeat(_rows(draw, None), _SIBLINGS), states)
 
         drawn["origins of x_2"] = _log_densities(log_transition, _in_families(children), siblings)
-    can_simulate = callable(getattr(model, "sample_observation", None))
-    if can_simulate and law.is_whole:
+    if callable(getattr(model, "sample_observation", None)) and law.is_whole:
         same = _repeat(_rows(after, slice(_PLACES)), _DRAWS)
         drawn["many y_1"] = _of_many_keys(_observe, keys[5], now, same)
         observations = _in_families(_observe(keys[5], now, _side_by_side(families)))
@@ -173,9 +160,9 @@ def _move(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:
 
 
 def _observe(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:
-    with asking(model, "sample_observation"):
+    with base.asking(model, "sample_observation"):
         observations = model.sample_observation(key, states)
-    check_states(observations, model, "sample_observation", len(jax.tree.leaves(states)[0]))
+    base.check_states(observations, model, "sample_observation", len(jax.tree.leaves(states)[0]))
     return observations
 
 
@@ -257,13 +244,12 @@ def _of_likelihood(model: Any, observation: PyTree, states: PyTree) -> Iterator[
     if (values == -np.inf).all():
         yield f"log_likelihood is -inf at all {len(values)} draws of x_1: no particle explains it"
     _warn_of_derivative(model, observation, states)
-    if getattr(model, "handles_missing", False):
-        partly = _with_first_missing(observation)
-        if partly is not None:
-            if np.isnan(_likelihoods(model, partly, states)).any():
-                yield "log_likelihood is NaN where a number is missing, despite handles_missing"
-            hint = "; blank it before it is used: y = jnp.where(jnp.isnan(y), 0.0, y)"
-            _warn_of_derivative(model, partly, states, f" where a number is missing{hint}")
+    partly = _with_first_missing(observation)
+    if getattr(model, "handles_missing", False) and partly is not None:
+        if np.isnan(_likelihoods(model, partly, states)).any():
+            yield "log_likelihood is NaN where a number is missing, despite handles_missing"
+        hint = "; blank it before it is used: y = jnp.where(jnp.isnan(y), 0.0, y)"
+        _warn_of_derivative(model, partly, states, f" where a number is missing{hint}")
 
 
 def _with_first_missing(observation: PyTree) -> PyTree:
@@ -284,7 +270,7 @@ def _warn_of_derivative(model: Any, observation: PyTree, states: PyTree, where: 
         # (TypeError) or of a call to the host (NotImplementedError). A filter needs none.
         return
     if any(np.isnan(slope).any() for slope in jax.tree.leaves(slopes)):
-        message = f"{model_name(model)}.log_likelihood has a derivative of NaN{where}"
+        message = f"{base.model_name(model)}.log_likelihood has a derivative of NaN{where}"
         warn(f"model: {message}", UserWarning)
 
 
@@ -336,5 +322,5 @@ def _of_births(
         locate = birth.locate[k] if isinstance(birth.locate, tuple) else birth.locate
         measurement = jax.tree.map(lambda leaf, row=rows[0]: leaf[row], scan)
         places, logs = locate(key, measurement, _DENSITY_DRAWS)
-        logs = real_each(logs, _DENSITY_DRAWS, "birth.locate")
+        logs = base.real_each(logs, _DENSITY_DRAWS, "birth.locate")
         yield from _of_density("birth.locate's log density", "its places", places, logs)

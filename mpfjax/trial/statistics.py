@@ -133,8 +133,7 @@ def _local_normals(
     turn = vectors / np.sqrt(values)
     log_volume = np.log(scale).sum() + 0.5 * np.log(values).sum()
     white, whitened = white @ turn, whitened @ turn
-    centres = white[:_CENTRES]
-    order = np.argsort(((white[None] - centres[:, None]) ** 2).sum(axis=2), axis=1)
+    order = np.argsort(((white[None] - white[:_CENTRES, None]) ** 2).sum(axis=2), axis=1)
     # On a curve or a surface the draws next to each other are flat.
     close = np.stack([np.linalg.eigvalsh(_moments(white[row[: 10 * d]])[1]) for row in order])
     if np.median(close[:, 0] / close[:, -1]) < 0.01:
