@@ -220,8 +220,7 @@ class RobotModel(AbstractStateSpaceModel, Fitting):
         x, y = np.diff(poses[:, :2], axis=0).T
         far, headings = np.hypot(x, y), poses[:-1, 2]
         along = np.abs(np.cos(np.arctan2(y, x) - headings))
-        follows = np.sum(far * along) > 0.9 * np.sum(far) > 0
-        if follows and np.mean(np.abs(headings)) > 0.5:
+        if np.sum(far * along) > 0.9 * np.sum(far) > 0 and np.mean(np.abs(headings)) > 0.5:
             warn("inputs: they look like poses; a RobotModel takes odometry_steps(poses)")
 
     def _may_be_at(self, poses: Poses) -> Array:

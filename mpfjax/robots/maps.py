@@ -58,18 +58,14 @@ class OccupancyGrid(Fitting):
         self.resolution, self.table = resolution, None
         self.origin = to_numbers("origin")(origin)[:2]
         far = np.add(self.origin, resolution * np.array(walls.shape[::-1]))
-        corners = np.stack([self.origin, far])
-        check_spacing("origin", corners, resolution, "the side of a cell is")
+        check_spacing("origin", np.stack([self.origin, far]), resolution, "the side of a cell is")
         edges = walls & ~np.asarray(binary_erosion(walls, np.ones((3, 3))), bool)
         self.distances = jnp.asarray(resolution * np.asarray(distance_transform_edt(~edges)), float)
 
     def cells(self, places: Float[Array, "*n 2"]) -> tuple[Array, Array, Array]:
         """Row and column of each position, or of the nearest cell, and whether it is on the map."""
-        columns, rows = (
-            jnp.floor((places[..., k] - self.origin[k]) / self.resolution).astype(jnp.int32)
-            for k in (0, 1)
-        )
-        return self._clip(rows, columns)
+        shares = ((places[..., k] - self.origin[k]) / self.resolution for k in (1, 0))
+        return self._clip(*(jnp.floor(share).astype(jnp.int32) for share in shares))
 
     def _clip(self, rows: Array, columns: Array) -> tuple[Array, Array, Array]:
         height, width = self.occupied.shape
@@ -102,9 +98,8 @@ class OccupancyGrid(Fitting):
         headings = poses[:, 2:] + angles[None]
         axes = []
         for k, way in ((0, jnp.cos(headings)), (1, jnp.sin(headings))):
-            start = jnp.broadcast_to(
-                (poses[:, k, None] - self.origin[k]) / self.resolution, way.shape
-            )
+            place = (poses[:, k, None] - self.origin[k]) / self.resolution
+            start = jnp.broadcast_to(place, way.shape)
             # To the first border, and between borders, along the ray.
             between = jnp.where(way == 0, jnp.inf, 1 / jnp.where(way == 0, 1.0, jnp.abs(way)))
             axes.append((start, way, between, jnp.where(way > 0, 1.0, 0.0)))
@@ -135,16 +130,16 @@ class OccupancyGrid(Fitting):
         reach = jax.lax.while_loop(lambda carry: jnp.any(carry[-1]), advance, carry)[0]
         return self.resolution * jnp.minimum(reach, limit)
 
-    def tabulated(self, num_angles: int = 120) -> "OccupancyGrid":
+    def tabulated(self, num_angles: int) -> "OccupancyGrid":
         """The map with a table of ranges from each cell's centre at several angles, for `ranges`.
 
         It has rows · columns · num_angles numbers. A range is the tabulated one along the nearest
         angle from the cell's centre, minus the distance of the position ahead of the centre. It is
-        approximate: on a map of cells of 5 cm with thin pillars, half of the errors are below 1 cm,
-        but six in a hundred beams of up to 3.5 m are off by more than 10 cm, at the edges of what
-        they hit or miss, and the mean error is 7 cm (5.5 cm with 240 angles). Use it with a
-        `BeamModel`, whose `z_rand` and `z_short` allow for such beams; its step then takes a small
-        part of the time.
+        approximate: on a map of cells of 5 cm with thin pillars, half of the errors with 120 angles
+        are below 1 cm, but six in a hundred beams of up to 3.5 m are off by more than 10 cm, at the
+        edges of what they hit or miss, and the mean error is 7 cm (5.5 cm with 240 angles). Use it
+        with a `BeamModel`, whose `z_rand` and `z_short` allow for such beams; its step then takes a
+        small part of the time.
         """
         angles = jnp.arange(num_angles, dtype=float) * (2 * np.pi / num_angles)
         rows, columns = self.resolution * (np.indices(self.occupied.shape) + 0.5)
@@ -159,16 +154,12 @@ class OccupancyGrid(Fitting):
         assert table is not None
         rows, columns, _ = self.cells(poses[:, None, :2])
         turn = 2 * np.pi / table.shape[2]
-        nearest = jnp.round((poses[:, 2:] + angles[None]) / turn).astype(jnp.int32)
-        nearest = nearest % table.shape[2]
+        nearest = jnp.round((poses[:, 2:] + angles[None]) / turn).astype(jnp.int32) % table.shape[2]
         ways = turn * jnp.arange(table.shape[2], dtype=poses.dtype)
         cos, sin = (stored(way(ways))[nearest] for way in (jnp.cos, jnp.sin))
-        x, y = (
-            poses[:, None, k] - self.origin[k] - self.resolution * (cells.astype(poses.dtype) + 0.5)
-            for k, cells in ((0, columns), (1, rows))
-        )
-        ranges = table[rows, columns, nearest] - (cos * x + sin * y)
-        return jnp.clip(ranges, 0.0, max_range)
+        centres = (self.resolution * (cells.astype(poses.dtype) + 0.5) for cells in (columns, rows))
+        x, y = (poses[:, None, k] - self.origin[k] - centre for k, centre in enumerate(centres))
+        return jnp.clip(table[rows, columns, nearest] - (cos * x + sin * y), 0.0, max_range)
 
 
 def ends_of(poses: Poses, angles: Angles, ranges: Float[Array, "#n b"]) -> Float[Array, "n b 2"]:
@@ -210,10 +201,8 @@ def read_map(path: str | Path, *, resolution: Positive | None = None) -> Occupan
     if entries["resolution"] is None:
         raise ValueError(f"resolution: {path} does not say the side of a pixel in metres")
     negated = str(entries["negate"]).lower() in _TRUE
-    side, walls_from, free_to = (
-        _number(name, entries[name], path)
-        for name in ("resolution", "occupied_thresh", "free_thresh")
-    )
+    names = ("resolution", "occupied_thresh", "free_thresh")
+    side, walls_from, free_to = (_number(name, entries[name], path) for name in names)
     origin = tuple(_number("origin", value, path) for value in entries["origin"])
     if any(origin[2:]):
         raise ValueError(f"origin: {entries['origin']} of {path} is turned; turn the image instead")
@@ -224,8 +213,7 @@ def read_map(path: str | Path, *, resolution: Positive | None = None) -> Occupan
     occupied = opaque & (probabilities > walls_from)
     free = opaque & (probabilities < free_to)
     unknown = 255 - _UNKNOWN if negated else _UNKNOWN
-    number = int(np.sum(free & (grey == unknown)))
-    if number:
+    if number := int(np.sum(free & (grey == unknown))):
         grey_of = f"{number} pixels of {unknown}, which map savers write for unknown cells"
         warn(f"free_thresh: {free_to:g} of {path} makes {grey_of}, free; .196 does not")
     return OccupancyGrid(occupied, free, resolution=side, origin=origin)

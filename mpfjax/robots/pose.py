@@ -93,8 +93,7 @@ def _next_log_odds(log_odds: Any, evidence: Any) -> Any:
 @eqx.filter_jit
 def _summary(mixture: ParticleMixture, radius: Array) -> tuple[Array, ...]:
     """Pose, covariance, the mass near the heaviest mean, and the components, which of them far."""
-    near, weights = _near(mixture, radius), mixture.weights
-    mass = jnp.where(near, weights, 0.0)
+    mass = jnp.where(_near(mixture, radius), mixture.weights, 0.0)
     share = jnp.sum(mass)
     x, y, heading = mixture.particles.T
     sums = [jnp.sum(mass * each) for each in (x, y, jnp.cos(heading), jnp.sin(heading))]
@@ -109,11 +108,7 @@ def _summary(mixture: ParticleMixture, radius: Array) -> tuple[Array, ...]:
 
 @checked
 def follow(
-    key: Key[Array, ""],
-    filter: Filter,
-    scans: Iterable[tuple[Any, Any]],
-    *,
-    radius: Positive = 1.0,
+    key: Key[Array, ""], filter: Filter, scans: Iterable[tuple[Any, Any]], *, radius: Positive = 1.0
 ) -> Iterator[PoseEstimate]:
     """The pose of the robot after each scan, as the scans arrive.
 
@@ -141,8 +136,7 @@ def follow(
         log_odds = _next_log_odds(log_odds, float(evidence))
         summary = _summary(mixture, jnp.asarray(radius))
         pose, covariance, share, means, weights = map(np.asarray, summary)
-        order = np.argsort(-weights)
-        order = order[weights[order] > _LEAST_WEIGHT]
+        order = np.argsort(-weights)[: np.sum(weights > _LEAST_WEIGHT)]
         share = min(float(share), 1.0)
         yield PoseEstimate(
             pose, covariance, share, float(1 - share / (1 + np.exp(log_odds))),

@@ -84,8 +84,7 @@ class AbstractLaser(Fitting):
         cos, sin = jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2])
         steps = [cos * forward - sin * left, sin * forward + cos * left, jnp.full_like(cos, turn)]
         ranges = jnp.where(met, scan, self.laser_max_range)
-        mounted = stored(poses.T + jnp.stack(steps)).T
-        logs = self.log_beams(ranges, mounted, angles, grid)
+        logs = self.log_beams(ranges, stored(poses.T + jnp.stack(steps)).T, angles, grid)
         return self.log_scan(jnp.where(is_used[None], logs, -jnp.inf), is_used)
 
     def usable(self, scan: Float[Array, " k"], met: Bool[Array, " k"]) -> Bool[Array, " k"]:
