@@ -128,11 +128,11 @@ def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows columns"]) -> N
 
 def format_tracks(rows: Float[np.ndarray, "rows columns"]) -> str:
     """The lines of rows (frame, id, x, y, w, h), or with score and class, in MOTChallenge form."""
-    return "".join(
-        f"{int(frame)},{int(track)},{x:.3f},{y:.3f},{w:.3f},{h:.3f}"
-        f",{score:g},{int(kind) or -1},-1,-1\n"
-        for frame, track, x, y, w, h, score, kind in _with_score_and_class(rows)
-    )
+    lines = []
+    for frame, track, *box, score, kind in _with_score_and_class(rows):
+        places = ",".join(f"{each:.3f}" for each in box)
+        lines.append(f"{int(frame)},{int(track)},{places},{score:g},{int(kind) or -1},-1,-1\n")
+    return "".join(lines)
 
 
 def _with_score_and_class(rows: np.ndarray) -> np.ndarray:

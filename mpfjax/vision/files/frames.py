@@ -220,20 +220,20 @@ def _read_video(
 ) -> Iterator[np.ndarray | None]:
     number, damaged, latest = 0, [], -math.inf
     step = 0.0 if times is None else 1 / (frame_rate(path) or _RATE)
-    for number, frame in enumerate(_decode(path), 1):
-        if number >= first and times is not None:
+    for number, frame in enumerate(itertools.islice(_decode(path), last), 1):
+        if number < first:
+            continue
+        if times is not None:
             stamp = -math.inf if frame is None or frame.time is None else float(frame.time)
             latest = stamp if stamp > latest else max(latest, -step) + step
             times.append(latest)
-        if number >= first and frame is None:
+        if frame is None:
             damaged.append(number)
             yield None
-        elif number >= first:
-            with _naming(path, "a video"):
-                image = _upright(frame)
-            yield image
-        if number == last:
-            break
+            continue
+        with _naming(path, "a video"):
+            image = _upright(frame)
+        yield image
     if number < first:
         raise ValueError(f"{path}: holds {number} frames, frame {first} is not among them")
     if damaged:

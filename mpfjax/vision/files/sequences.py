@@ -48,10 +48,8 @@ class Truth(NamedTuple):
 
     def between(self, first: int, last: float = np.inf) -> "Truth":
         """The rows of frames `first` to `last`, both included."""
-        objects, ignored = (
-            rows[(first <= rows[:, 0]) & (rows[:, 0] <= last)]
-            for rows in (self.objects, self.ignored)
-        )
+        tables = self.objects, self.ignored
+        objects, ignored = (rows[(first <= rows[:, 0]) & (rows[:, 0] <= last)] for rows in tables)
         return Truth(objects, ignored, self.min_height)
 
 
@@ -86,7 +84,8 @@ def read_truth(path: str | Path, *, format: Format | None = None) -> Truth:
     """
     path = _truth_file(Path(path))
     rows = read_rows(path, TRACK_FORM, TRACK_COLUMNS)
-    name = _name_of(path).lower()
+    folder = path.parent.parent if path.parent.name == "gt" else path.parent
+    name = (read_sequence_info(folder).name or folder.resolve().name).lower()
     table = np.full((len(rows), TRACK_COLUMNS.stop - 1), np.nan)
     for here, row in zip(table, rows.values(), strict=True):
         here[: len(row)] = row
@@ -113,8 +112,7 @@ def read_truth(path: str | Path, *, format: Format | None = None) -> Truth:
     for number in np.array(list(rows))[counts & (boxes[:, 1] < 0)]:
         raise ValueError(f"{path}, line {number}: an object without an id, which is at least 0")
     ignored = np.concatenate([ignored, _ignore_file(path.parent / "ignore.txt")])
-    min_height = _KITTI_HEIGHT if name.startswith("kitti") else 0.0
-    return Truth(boxes[counts], ignored, min_height)
+    return Truth(boxes[counts], ignored, _KITTI_HEIGHT if name.startswith("kitti") else 0.0)
 
 
 def _truth_file(path: Path) -> Path:
@@ -141,8 +139,7 @@ def _format_of(path: Path, name: str, table: Float[np.ndarray, "r 10"]) -> Forma
     if not np.isin(flags, [0, 1]).all():
         return "cvat"
     if np.isnan(occlusions).all() and has_classes:
-        visible = (truncations >= 0) & (truncations <= 1)
-        return "motchallenge" if visible.all() else "cvat"
+        return "motchallenge" if ((truncations >= 0) & (truncations <= 1)).all() else "cvat"
     few = np.isin(truncations, range(2)) & np.isin(occlusions, range(3))
     return "visdrone" if (few & np.isin(classes, _CATEGORIES)).all() else "cvat"
 
@@ -159,12 +156,6 @@ def _ignore_file(path: Path) -> Float[np.ndarray, "r 6"]:
     form = "frame,kind,x,y,w,h with the kind 1 or 2"
     rows = read_rows(path, form, range(6, 7), holds=None) if path.is_file() else {}
     return np.array(list(rows.values())).reshape(-1, 6)
-
-
-def _name_of(truth: Path) -> str:
-    """The name in the `seqinfo.ini` of the sequence, or that of its folder."""
-    folder = truth.parent.parent if truth.parent.name == "gt" else truth.parent
-    return read_sequence_info(folder).name or folder.resolve().name
 
 
 class SequenceInfo(NamedTuple):

@@ -79,10 +79,9 @@ class Detections(NamedTuple):
             parts: Any = output if several else (output,)
             output = cls(*parts)
         rows, (scores, classes, vectors) = to_rows(coordinates, named, output.boxes), output[1:]
-        if scores is not None:
-            scores = _one_each(named, "scores", scores, len(rows))
+        scores = _one_each(named, "scores", scores, len(rows))
+        classes = _one_each(named, "classes", classes, len(rows))
         if classes is not None:
-            classes = _one_each(named, "classes", classes, len(rows))
             if (classes % 1 != 0).any() or (classes < 0).any():
                 raise ValueError(f"{named}: classes {shown(classes)} are no whole numbers from 0")
             classes = classes.astype(int)
@@ -94,8 +93,10 @@ class Detections(NamedTuple):
         return cls(rows, scores, classes, vectors)
 
 
-def _one_each(named: str, what: str, values: Any, number: int) -> np.ndarray:
-    """The scores, or classes, as numbers, one for each box."""
+def _one_each(named: str, what: str, values: Any, number: int) -> np.ndarray | None:
+    """The scores, or classes, as numbers, one for each box; None where there are none."""
+    if values is None:
+        return None
     numbers = np.array(to_numbers(f"{named}: {what}")(values))
     if len(numbers) != number:
         raise ValueError(f"{named}: {len(numbers)} {what} for {number} boxes")

@@ -12,11 +12,11 @@ from mpfjax.checks import optional
 from mpfjax.vision.files.frames import check_frame, of_one_kind
 from mpfjax.vision.tracking.gaussian import CameraMotion
 
+Box = tuple[int, int, int, int]
+
 
 def reduce(frame: np.ndarray, factor: int) -> np.ndarray:
     """The means over squares of pixels, so many along each side."""
-    if factor == 1:
-        return frame
     cv2 = opencv()
     size = max(frame.shape[1] // factor, 1), max(frame.shape[0] // factor, 1)
     return cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
@@ -104,8 +104,7 @@ class BackgroundSubtraction:
         shares = boxes[:, 2] * boxes[:, 3] / foreground.size
         boxes = boxes[(shares >= _LEAST_AREA) & (shares <= _MOST_AREA)]
         boxes = boxes[np.lexsort((boxes[:, 1], boxes[:, 0]))]
-        scale = np.divide(np.shape(frame)[1::-1], foreground.shape[::-1])
-        return boxes * np.tile(scale, 2)
+        return boxes * np.tile(np.divide(np.shape(frame)[1::-1], foreground.shape[::-1]), 2)
 
     def _subtract(self, frame: np.ndarray, rate: float) -> np.ndarray:
         """1 where a pixel is foreground; the frame joins the background with weight `rate`."""
@@ -117,10 +116,9 @@ class BackgroundSubtraction:
         self._shape = frame.shape
         factor = int(np.ceil(np.sqrt(frame[..., 0].size / _MOST_PIXELS)))
         small = reduce(np.ascontiguousarray(frame), factor)
-        mask = self._background.apply(small, learningRate=rate)
-        return (mask == _FOREGROUND).astype(np.uint8)
+        return (self._background.apply(small, learningRate=rate) == _FOREGROUND).astype(np.uint8)
 
-    def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
+    def _blobs(self, foreground: np.ndarray) -> list[Box]:
         usual = _UNKNOWN_HEIGHT * len(foreground)
         if len(self._sizes) >= _ENOUGH:
             usual = float(np.median([height for height, _ in self._sizes]))
@@ -147,9 +145,7 @@ class BackgroundSubtraction:
             boxes += self._cut(blob, x, y, widest)
         return boxes
 
-    def _cut(
-        self, blob: Bool[np.ndarray, "h w"], x: int, y: int, widest: float
-    ) -> list[tuple[int, int, int, int]]:
+    def _cut(self, blob: Bool[np.ndarray, "h w"], x: int, y: int, widest: float) -> list[Box]:
         """The boxes of the objects side by side in a blob, whose array begins at (x, y)."""
         rows, columns = (np.flatnonzero(blob.any(axis=axis)) for axis in (1, 0))
         if len(rows) == 0:
@@ -228,8 +224,7 @@ class OpticalFlow:
             return None
         start, end = self._follow(before, picture, left)
         gaps = end[:, None] - self._boxes[None, :, :2]
-        within = (gaps >= 0) & (gaps <= self._boxes[None, :, 2:])
-        away = ~np.any(within.all(axis=2), axis=1)
+        away = ~np.any(np.all((gaps >= 0) & (gaps <= self._boxes[None, :, 2:]), axis=2), axis=1)
         return self._fit(start[away], end[away], factor)
 
     def _follow(

@@ -92,7 +92,6 @@ def track(
     for "pixels" without OpenCV. An exception of the detector is passed on, with the number of the
     frame. Use it for recorded videos and for cameras.
     """
-    del key
     kind = BOXES if tracker is None else tracker.kind
     detector = as_detector(detections, kind.coordinates)
     if frames is None and (callable(detector) or camera_motion == "pixels"):
