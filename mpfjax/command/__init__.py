@@ -48,25 +48,22 @@ def parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
     )  # fmt: skip
     # A box that reaches beyond the left border is no option, though it begins with a minus sign.
     track._negative_number_matcher = re.compile(r"-[\d.]")
-    _add_input(track)
-    _add_tracking(track)
-    _add_output(track)
+    _add_options(track)
     return parser, track
 
 
-def _add_input(track: argparse.ArgumentParser) -> None:
-    """The frames, and what to track in them."""
-    option, what = track.add_argument, track.add_mutually_exclusive_group()
+def _add_options(track: argparse.ArgumentParser) -> None:
+    """The frames and what to track in them, how to track, and what to write."""
+    option, what = track.add_argument, track.add_mutually_exclusive_group().add_argument
     source = "a video, a folder of images, or detections: a file of them, or a folder with det.txt"
     option("source", type=_existing, metavar="SOURCE", help=source)
     rows = "MOTChallenge rows, with scores if any"
-    what.add_argument("--detections", type=_existing, metavar="FILE", help=rows)
-    what.add_argument("--detect", action="store_true", help="what moves; the camera stands still")
+    what("--detections", type=_existing, metavar="FILE", help=rows)
+    what("--detect", action="store_true", help="what moves; the camera stands still")
     box = "an object in the first frame; repeat it"
-    what.add_argument("--box", action="append", metavar="x,y,w,h", help=box)
+    what("--box", action="append", metavar="x,y,w,h", help=box)
     option("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
-    classes = "the eighth column of detections is their class"
-    option("--classes", action="store_true", help=classes)
+    option("--classes", action="store_true", help="the eighth column of detections is their class")
     points = "detections are points, rows frame,id,x,y,score,class, with errors of this deviation"
     option("--point-deviation", type=positive, metavar="S", help=points)
     option("--min-score", type=finite, metavar="S", help="leave out weaker detections")
@@ -75,23 +72,14 @@ def _add_input(track: argparse.ArgumentParser) -> None:
     truth = "gt.txt to score with, where none is beside img/"
     option("--truth", type=_existing, metavar="FILE", help=truth)
 
-
-def _add_tracking(track: argparse.ArgumentParser) -> None:
-    """How to track."""
-    option = track.add_argument
     option("--seed", type=seed, default=0, help="of the random numbers")
-    room = "room for objects at a time"
-    option("--max-objects", type=whole(1, 1024), metavar="M", help=room)
+    option("--max-objects", type=whole(1, 1024), metavar="M", help="room for objects at a time")
     lost = "an object ends after so long without a detection; by default after a second"
     option("--lost-seconds", type=positive, metavar="T", help=lost)
     option("--no-colour", action="store_true", help="track the detections alone, without pixels")
     motion = "what it is found from; by default from pixels, except with --detect and --no-colour"
     option("--camera-motion", choices=("pixels", "detections"), help=motion)
 
-
-def _add_output(track: argparse.ArgumentParser) -> None:
-    """What to write."""
-    option = track.add_argument
     option("--out", type=Path, required=True, metavar="DIR", help="where results go")
     option("--no-video", action="store_true", help="do not draw tracking.mp4")
     form = "coco and csv write tracks.json or tracks.csv beside tracks.txt"

@@ -1,8 +1,8 @@
 """What the arguments of the command name: the frames, and what is known of them."""
 
-import argparse
 import os
 import warnings
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,7 +41,7 @@ class Source(NamedTuple):
     times: list[float]  # of the frames of a video that have been read, in seconds
 
 
-def check_options(track: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+def check_options(track: ArgumentParser, options: Namespace) -> None:
     """An error of `track` for options that do not go together."""
     by_pixels, has_pixels = options.camera_motion == "pixels", _has_pixels(options.source)
     of_pixels = {"detect": options.detect, "box": options.box, "camera-motion pixels": by_pixels}
@@ -59,7 +59,7 @@ def check_options(track: argparse.ArgumentParser, options: argparse.Namespace) -
                 track.error(f"argument --{name}: not allowed with --{option}")
 
 
-def open_source(options: argparse.Namespace) -> Source:
+def open_source(options: Namespace) -> Source:
     """The source of the frames; a `ValueError` for one that cannot be read."""
     first, last = frames.parse_range(options.frames)
     path, has_pixels = options.source, _has_pixels(options.source)
@@ -139,7 +139,7 @@ def _sequence_of(detections: Path) -> Path | None:
     return next(folders, None)
 
 
-def _detections_alone(options: argparse.Namespace) -> Path:
+def _detections_alone(options: Namespace) -> Path:
     """The file of detections where there are no pixels: that of the folder, or the source."""
     path = options.source
     if options.detections is not None or path.is_file():
