@@ -78,9 +78,8 @@ def draw_plane(
     for m, t, colours in _living(ax, weights):
         places, plane = means[t, m][:, indices], np.ix_(range(len(t)), indices, indices)
         squares, ways = np.linalg.eigh(covariances[t, m][plane])
-        for place, sizes, way, colour in zip(
-            places, 4 * np.sqrt(np.maximum(squares, 0)), ways, colours * _PALE, strict=True
-        ):
+        sides = 4 * np.sqrt(np.maximum(squares, 0))
+        for place, sizes, way, colour in zip(places, sides, ways, colours * _PALE, strict=True):
             angle = np.degrees(np.arctan2(way[1, 1], way[0, 1]))
             ax.add_patch(Ellipse(tuple(place), *sizes[::-1], angle=angle, fc=colour, lw=0))
         ax.scatter(*places.T, s=9, lw=0, c=colours)

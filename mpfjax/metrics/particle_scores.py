@@ -5,10 +5,7 @@ from typing import Annotated
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.arrays import (
-    NOT_NEGATIVE,
-    real_array,
-)
+from mpfjax.arrays import NOT_NEGATIVE, real_array
 from mpfjax.checks import checked
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
@@ -63,5 +60,4 @@ def log_score(
     """
     observation = one_observation(observation)
     values = law_of(model).log_likelihood(observation, mixture.particles)
-    joint = jnp.where(mixture.occupied, mixture.log_weights + values, -jnp.inf)
-    return -log_sum_exp(joint)
+    return -log_sum_exp(jnp.where(mixture.occupied, mixture.log_weights + values, -jnp.inf))

@@ -11,9 +11,7 @@ from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from mpfjax.arrays import (
-    to_rows,
-)
+from mpfjax.arrays import to_rows
 from mpfjax.checks import Positive, checked, number
 
 Exponent = Annotated[float, number(lambda p: 1 <= p < np.inf, "a finite number of at least 1")]
