@@ -493,7 +493,7 @@ REFUSED = (
     ("run: its filter stores no Eve", lambda: log_marginal_likelihood_variance(HISTORY)),
     ("runs: 1; a standard error requires at least 4", lambda: batch_estimate(HISTORY, nothing)),
     # tuning
-    (r"num_samples: 800 .* num_moves \+ 1: 798 or 804", lambda: tuning.smc2(
+    (r"num_samples: 800 .* num_moves \+ 1 = 6; use 798 or 804", lambda: tuning.smc2(
         KEY, OF_SCALAR, TWO, 800, sample_prior=nothing, log_prior=nothing, **OF_A)),
     ("(?s)filter: .* none of its moves is approximate", lambda: chain(GAUSSIAN)),
     (r"proposal_deviations: those of \['b'\]", lambda: chain(proposal_deviations={"b": 1.0})),
