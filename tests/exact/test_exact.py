@@ -23,28 +23,21 @@ MODEL = {
 SCALAR = {"A": [[0.8]], "Q": [[0.2]], "H": [[1.5]], "R": [[0.3]], "m0": [0.4], "P0": [[0.6]]}
 
 
-def joint_gaussian(A, Q, H, R, m0, P0, length, with_first=False):
-    """Mean and covariance of (x_1..x_T, y_1..y_T), from the definition of the model.
-
-    `with_first` has x_0 before them.
-    """
-    A, Q, H, R, m0, P0 = (np.asarray(part, float) for part in (A, Q, H, R, m0, P0))
-    d, p = len(m0), len(H)
-    # (x_0, w_1..w_T, v_1..v_T), independent, to (x_1..x_T, y_1..y_T).
-    source = scipy.linalg.block_diag(P0, *[Q] * length, *[R] * length)
-    matrix = np.zeros((length * (d + p), len(source)))
-    for t in range(length):
-        rows = slice(t * d, (t + 1) * d)
-        for s in range(t + 2):
-            matrix[rows, s * d : (s + 1) * d] = np.linalg.matrix_power(A, t + 1 - s if s else t + 1)
-        seen = slice(length * d + t * p, length * d + (t + 1) * p)
-        matrix[seen] = H @ matrix[rows]
-        noise = d * (length + 1) + t * p
-        matrix[seen, noise : noise + p] = np.eye(p)
-    if with_first:
-        matrix = np.concatenate([np.eye(d, len(source)), matrix])
-    mean = matrix[:, :d] @ m0
-    return mean, matrix @ source @ matrix.T
+def joint_gaussian(m0, P0, steps):
+    """Mean and covariance of (x_0..x_T, y_1..y_T), of a model with its own parts at each step."""
+    # All of them as sums of the independent x_0, w_1..w_T, v_1..v_T.
+    sources = [P0, *(step["Q"] for step in steps), *(step["R"] for step in steps)]
+    ends = np.cumsum([len(source) for source in sources])
+    first, *noises = np.split(np.eye(ends[-1]), ends[:-1])
+    states, means, seen, seen_means = [first], [np.asarray(m0)], [], []
+    for t, step in enumerate(steps):
+        states.append(step["A"] @ states[-1] + noises[t])
+        means.append(step["A"] @ means[-1] + step.get("b", 0.0))
+        seen.append(step["H"] @ states[-1] + noises[len(steps) + t])
+        seen_means.append(step["H"] @ means[-1])
+    matrix = np.concatenate(states + seen)
+    covariance = matrix @ scipy.linalg.block_diag(*sources) @ matrix.T
+    return np.concatenate(means + seen_means), covariance
 
 
 NAN = np.nan
@@ -74,7 +67,7 @@ def test_kalman_filter_and_smoother_condition_the_joint_gaussian(parts, observat
     model, length = mpfjax.LinearGaussianModel(**parts), len(observations)
     run = kalman_smoother(model, Series.skipping(observations))
     filtered = kalman_filter(model, Series.skipping(observations))
-    mean, covariance = joint_gaussian(**parts, length=length, with_first=True)
+    mean, covariance = joint_gaussian(parts["m0"], parts["P0"], [parts] * length)
     states, y = 2 * (length + 1), observations.ravel()
     evidence = [0.0]
     for t in range(1, length + 1):

@@ -16,32 +16,6 @@ NUM_RUNS, NUM_STEPS = 4000, 3
 KEYS = jax.random.split(jax.random.key(0), NUM_RUNS)
 
 
-def test_densities_of_the_quadratic_model_are_scipys():
-    states, previous = np.array([0.1, -1.0, 2.0]), np.array([0.3, -1.0, 1.0])
-    arrays, norm = (jnp.asarray(states), jnp.asarray(previous)), scipy.stats.norm
-    found = QUADRATIC.log_likelihood(jnp.array(0.8), arrays[0])
-    np.testing.assert_allclose(found, norm(states**2, 0.5).logpdf(0.8), rtol=1e-5)
-    found = QUADRATIC.log_transition(*arrays)
-    np.testing.assert_allclose(found, norm(previous, 0.3).logpdf(states), rtol=1e-5)
-    initial = QUADRATIC.log_initial(jnp.array([-2.1, 0.0, 1.9]))
-    np.testing.assert_allclose(initial, [-np.inf, -np.log(4), -np.log(4)], rtol=1e-6)
-
-
-def test_densities_of_the_linear_model_are_scipys():
-    states, previous = np.random.default_rng(2).normal(size=(2, 5, 2))
-    normal, parts, y = scipy.stats.multivariate_normal, MODEL, np.array([0.7, -0.3])
-    for found, mean, covariance, points in (
-        (LINEAR.log_likelihood(jnp.asarray(y), jnp.asarray(states)), states @ parts["H"].T,
-         parts["R"], np.tile(y, (5, 1))),
-        (LINEAR.log_transition(jnp.asarray(states), jnp.asarray(previous)),
-         previous @ parts["A"].T, parts["Q"], states),
-        (LINEAR.log_initial(jnp.asarray(states)), np.tile(parts["m0"], (5, 1)), parts["P0"],
-         states),
-    ):  # fmt: skip
-        expected = [normal(m, covariance).logpdf(x) for m, x in zip(mean, points, strict=True)]
-        np.testing.assert_allclose(found, expected, rtol=1e-4)
-
-
 @pytest.mark.parametrize("draw", ["stratified", "independent"])
 def test_x0_is_uniform(draw):
     model = mpfjax.QuadraticModel(low=-1.0, high=3.0, initial_draw=draw)
@@ -58,7 +32,7 @@ def test_simulated_series_have_the_moments_of_the_joint_gaussian():
     )
     assert states.shape == (NUM_RUNS, NUM_STEPS + 1, 2)
     assert observations.shape == (NUM_RUNS, NUM_STEPS, 2)
-    mean, covariance = joint_gaussian(**MODEL, length=NUM_STEPS, with_first=True)
+    mean, covariance = joint_gaussian(MODEL["m0"], MODEL["P0"], [MODEL] * NUM_STEPS)
     rows = np.concatenate([states.reshape(NUM_RUNS, -1), observations.reshape(NUM_RUNS, -1)], 1)
     deviations = np.sqrt(np.diag(covariance))
     z = (rows.mean(0) - mean) / deviations * np.sqrt(NUM_RUNS)
@@ -129,12 +103,3 @@ def test_a_model_of_one_particle_has_the_densities_and_means_of_the_batched_one(
     ):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
     assert not hasattr(mpfjax.per_particle(DriftOfOne()), "noise_dimension")
-
-
-def test_a_model_of_one_particle_draws_each_from_a_key_of_its_own():
-    wrapped = mpfjax.per_particle(DriftOfOne())
-    states = wrapped.sample_initial(jax.random.key(6), 5)
-    moved = wrapped.sample_transition(jax.random.key(7), jnp.zeros((5, 2)))
-    for drawn in (states, moved):
-        assert drawn.shape == (5, 2)
-        assert len(np.unique(np.asarray(drawn))) == 10

@@ -10,43 +10,26 @@ from scipy.stats import multivariate_normal
 
 import mpfjax
 from mpfjax.exact import kalman_filter, kalman_smoother, switching_filter
+from tests.exact.test_exact import joint_gaussian
 from tests.switching import INITIAL, MODEL, NUM_REGIMES, OBSERVATIONS, PARTS, TRANSITIONS
 
 
 def parts_of(regime):
     """The matrices of one regime, as numpy."""
     own = {name: np.array(value, float) for name, value in PARTS.items()}
-    return {
-        name: value[regime] if name in ("F", "Q", "R", "b") else value
-        for name, value in own.items()
-    }
+    parts = {name: own[name][regime] if name in "FQRb" else own[name] for name in own}
+    return parts | {"A": parts.pop("F")}
 
 
 def test_the_evidence_and_the_smoothed_regimes_are_those_of_the_joint_normal_of_all_observations():
     """p(y_1, y_2 | z_0, z_1, z_2) is one normal density, whose moments follow from x_0."""
-    ys = np.asarray(OBSERVATIONS[:2, 0], float)
     log_joint = {}
     for sequence in itertools.product(range(NUM_REGIMES), repeat=3):
-        prior = INITIAL[sequence[0]]
-        mean = np.array(PARTS["m0"])
-        # x_t as a linear map of x_0, w_1, w_2; y_t as one of these and its own noise.
-        covariance, rows, means = np.array(PARTS["P0"]), [], []
-        maps = [np.eye(2)]
-        sources = [covariance]
-        for t in (1, 2):
-            prior *= TRANSITIONS[sequence[t - 1], sequence[t]]
-            part = parts_of(sequence[t])
-            maps = [part["F"] @ one for one in maps] + [np.eye(2)]
-            sources.append(part["Q"])
-            mean = part["F"] @ mean + part["b"]
-            rows.append([part["H"] @ one for one in maps])
-            means.append((part["H"] @ mean)[0])
-        joint = np.zeros((2, 2))
-        for i, j in itertools.product(range(2), repeat=2):
-            shared = zip(rows[i], rows[j], sources, strict=False)
-            joint[i, j] = sum((a @ source @ b.T)[0, 0] for a, b, source in shared)
-            joint[i, j] += (i == j) * parts_of(sequence[i + 1])["R"][0, 0]
-        log_joint[sequence] = np.log(prior) + multivariate_normal.logpdf(ys, means, joint)
+        prior = INITIAL[sequence[0]] * TRANSITIONS[sequence[:-1], sequence[1:]].prod()
+        steps = [parts_of(regime) for regime in sequence[1:]]
+        mean, covariance = joint_gaussian(PARTS["m0"], PARTS["P0"], steps)
+        of_seen = multivariate_normal(mean[6:], covariance[6:, 6:])
+        log_joint[sequence] = np.log(prior) + of_seen.logpdf(OBSERVATIONS[:2, 0])
     run = switching_filter(MODEL, OBSERVATIONS[:2])
     log_evidence = np.logaddexp.reduce(list(log_joint.values()))
     np.testing.assert_allclose(run.log_marginal_likelihood, log_evidence, rtol=1e-5)
@@ -59,9 +42,10 @@ def test_the_evidence_and_the_smoothed_regimes_are_those_of_the_joint_normal_of_
 
 @pytest.mark.exactness
 def test_with_equal_regimes_it_is_the_kalman_filter_and_smoother_where_numbers_are_missing_too():
-    model = mpfjax.SwitchingLinearGaussianModel(TRANSITIONS, **parts_of(1))
     parts = parts_of(1)
-    linear = mpfjax.LinearGaussianModel(A=parts.pop("F"), B=parts.pop("b")[:, None], **parts)
+    push = parts.pop("b")
+    linear = mpfjax.LinearGaussianModel(B=push[:, None], **parts)
+    model = mpfjax.SwitchingLinearGaussianModel(TRANSITIONS, F=parts.pop("A"), b=push, **parts)
     observations, inputs = OBSERVATIONS.at[2].set(jnp.nan), jnp.ones((len(OBSERVATIONS), 1))
     series = mpfjax.Series.skipping(observations)
     found = switching_filter(model, series)

@@ -12,7 +12,13 @@ from jax.scipy.stats import cauchy, norm, poisson
 import mpfjax
 from tests import switching
 from tests.marking import quick_of, weekly
-from tests.user_models import DRIFT_AS_LINEAR_GAUSSIAN, Drift, DriftOfOne, ScalarLinear
+from tests.user_models import (
+    DRIFT_AS_LINEAR_GAUSSIAN,
+    Drift,
+    DriftOfOne,
+    ScalarLinear,
+    TwoSensors,
+)  # fmt: skip
 
 NUMBER = jnp.asarray(0.3)
 ONE = mpfjax.LinearGaussianModel(A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]])
@@ -263,7 +269,9 @@ RIGHT = {
 }
 
 
-QUICK = ["x_0 known", "births and deaths", "returns"]
+QUICK = [
+    "x_0 known", "births and deaths", "returns", "of one particle", "quadratic", "matrices",
+]  # fmt: skip
 
 
 def is_accepted(name, num_keys, recwarn):
@@ -406,19 +414,7 @@ def test_a_proposal_must_have_the_density_of_its_draws():
         mpfjax.check_model(key, Observed(), NUMBER, proposal=Guess(0.36))
 
 
-class Sensors(Drift):
-    """Two readings with one gain, either of which may be missing."""
-
-    gain: jax.Array = eqx.field(default_factory=lambda: jnp.asarray(2.0))
-    handles_missing = True
-
-    def log_likelihood(self, observation, states):
-        is_there = ~jnp.isnan(observation)
-        errors = jnp.where(is_there, observation, 0.0)[None] - self.gain * states
-        return -0.5 * jnp.sum(jnp.where(is_there[None], errors, 0.0) ** 2, axis=1)
-
-
-class Careless(Sensors):
+class Careless(TwoSensors):
     def log_likelihood(self, observation, states):
         errors = jnp.where(
             jnp.isnan(observation)[None], 0.0, self.gain * (observation[None] - states)
@@ -426,14 +422,14 @@ class Careless(Sensors):
         return -0.5 * jnp.sum(errors**2, axis=1)
 
 
-class Forgotten(Sensors):
+class Forgotten(TwoSensors):
     def log_likelihood(self, observation, states):
         return -0.5 * jnp.sum((observation[None] - self.gain * states) ** 2, axis=1)
 
 
 def test_a_missing_number_must_leave_the_likelihood_and_its_derivative_finite(recwarn):
     key, seen = jax.random.key(0), jnp.array([0.3, 0.1])
-    mpfjax.check_model(key, Sensors(), seen)
+    mpfjax.check_model(key, TwoSensors(), seen)
     assert not recwarn.list
     with pytest.warns(UserWarning, match=r"Careless.*derivative of NaN where a number is missing"):
         mpfjax.check_model(key, Careless(), seen)
