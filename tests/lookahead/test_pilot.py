@@ -36,17 +36,15 @@ def test_it_is_the_mean_of_both_likelihoods_shrunk_by_their_correlation():
     np.testing.assert_allclose(found, expected, rtol=2e-3)
 
 
-def test_nothing_is_selected_where_a_step_is_wider_than_the_likelihood():
-    states = jnp.linspace(0.9, 1.1, 50)
-    found = ahead(mpfjax.QuadraticModel(0.5, 0.1), jnp.float32(1.0), states, np.full(50, 1 / 50))
-    np.testing.assert_array_equal(found, 1.0)
-
-
-def test_where_a_step_is_narrow_three_quarters_of_the_likelihood_are_trusted():
-    states = jnp.linspace(0.0, 4.0, 50)
-    found = ahead(mpfjax.QuadraticModel(1e-4, 1.0), jnp.float32(1.0), states, np.full(50, 1 / 50))
-    likelihoods = np.exp(-0.5 * (1.0 - np.linspace(0.0, 4.0, 50) ** 2) ** 2)
-    np.testing.assert_allclose(found, 1 / 4 + 3 / 4 * likelihoods / likelihoods.mean(), rtol=1e-2)
+@pytest.mark.parametrize(("sigma_x", "sigma_y", "trust"), [(0.5, 0.1, 0.0), (1e-4, 1.0, 0.75)])
+def test_wide_steps_select_nothing_and_narrow_ones_trust_three_quarters(sigma_x, sigma_y, trust):
+    """Of the likelihood, or where a step is wider than it is."""
+    states = np.linspace(0.9, 1.1, 50) if trust == 0 else np.linspace(0.0, 4.0, 50)
+    model = mpfjax.QuadraticModel(sigma_x, sigma_y)
+    found = ahead(model, jnp.float32(1.0), jnp.asarray(states), np.full(50, 1 / 50))
+    likelihoods = np.exp(-0.5 * ((1.0 - states**2) / sigma_y) ** 2)
+    expected = 1 - trust + trust * likelihoods / likelihoods.mean()
+    np.testing.assert_allclose(found, expected, rtol=1e-2 * (trust > 0))
 
 
 @pytest.mark.parametrize("noise", ["rqmc", "independent"])

@@ -21,7 +21,6 @@ from mpfjax import (
     Resample,
     Split,
 )
-from mpfjax.moves.regrouping.features import summarise, summarise_about
 from tests.examples import make_mixture
 
 KEY = jax.random.key(0)
@@ -282,40 +281,30 @@ def test_only_what_is_below_the_share_of_the_heaviest_is_pruned(masses):
     assert Prune(1e-3)(KEY, before, mpfjax.Step(MODEL)) is before
 
 
-def test_each_particle_is_weighed_down_by_the_other_components_means():
-    states = np.array([[0.0], [1.0], [1.5], [9.0], [7.0]])
-    log_weights = np.array([0.0, 1.0, 0.5, 0.0, -np.inf])
-    mixture = make_mixture(states, log_weights, [0, 0, 1, 2, 2], 4)
-    move = eqx.filter_jit(Exclusion(strength=3.0, radius=0.5, scale=2.0))
-    moved = move(KEY, mixture, mpfjax.Step(MODEL, jnp.float32(0.0)))
-    means = np.array([0.5, 1.5, 9.0]) / 2
-    bumps = np.exp(-((states / 2 - means[None]) ** 2) / (2 * 0.5**2))
-    own = np.array([0, 0, 1, 2])
-    expected = [bumps[i].sum() - bumps[i, own[i]] for i in range(4)]
-    lowered = np.asarray(mixture.log_weights - moved.log_weights)[:4]
-    np.testing.assert_allclose(lowered, 3.0 * np.array(expected), rtol=1e-5, atol=1e-6)
-    assert moved.log_weights[4] == -np.inf
-    np.testing.assert_array_equal(moved.particles, mixture.particles)
+def second(states):
+    return states[:, 1].astype(np.int32)
 
 
-def test_objects_are_weighed_down_by_the_others_and_not_by_hypotheses_about_themselves():
-    """Object 0 is at 1 with 4/5 of its weight and at 50 with 1/5, object 1 at 5 with all of it."""
-    places = np.array([0.0, 2.0, 50.0, 4.0, 6.0])
-    states = np.stack([places, [0, 0, 0, 1, 1]], axis=1)
-    mixture = make_mixture(states, np.log([0.2, 0.2, 0.1, 0.3, 0.2]), [0, 0, 1, 2, 2], 4)
+@pytest.mark.parametrize(
+    ("group", "objects", "shares"),
+    [(None, [0, 1, 2], [1, 1, 1]), (second, [0, 0, 1], [0.8, 0.2, 1])],
+)
+def test_particles_are_weighed_down_by_the_means_of_others(group, objects, shares):
+    """Of components at 1, 50 and 5; in groups not by hypotheses about their own object."""
+    places, labels = np.array([0.0, 2.0, 50.0, 4.0, 6.0, 7.0]), np.array([0, 0, 1, 2, 2, 2])
+    log_weights = np.append(np.log([0.2, 0.2, 0.1, 0.3, 0.2]), -np.inf)
+    mixture = make_mixture(np.stack([places, labels == 2], axis=1), log_weights, labels, 4)
     move = Exclusion(
-        strength=2.0, radius=0.5, scale=(10.0,), features=lambda states: states[:, :1],
-        group=lambda states: states[:, 1].astype(np.int32),
-    )  # fmt: skip
+        strength=2.0, radius=0.5, scale=(10.0,), features=lambda states: states[:, :1], group=group
+    )
     moved = eqx.filter_jit(move)(KEY, mixture, mpfjax.Step(MODEL, jnp.float32(0.0)))
-
-    def near(a, b):
-        return np.exp(-(((a - b) / 10) ** 2) / (2 * 0.5**2))
-
-    of_object_0 = [2 * near(x, 5.0) for x in places[:3]]
-    of_object_1 = [2 * (0.8 * near(x, 1.0) + 0.2 * near(x, 50.0)) for x in places[3:]]
-    penalty = np.asarray(mixture.log_weights - moved.log_weights)
-    np.testing.assert_allclose(penalty, of_object_0 + of_object_1, atol=1e-5)
+    bumps = np.exp(-(((places[:, None] - [1.0, 50.0, 5.0]) / 10) ** 2) / (2 * 0.5**2))
+    of_others = np.array(objects)[labels][:, None] != objects
+    expected = 2 * np.sum(bumps * of_others * shares, axis=1)
+    lowered = np.asarray(mixture.log_weights - moved.log_weights)
+    np.testing.assert_allclose(lowered[:5], expected[:5], atol=1e-5)
+    assert moved.log_weights[5] == -np.inf
+    np.testing.assert_array_equal(moved.particles, mixture.particles)
 
 
 def test_pruning_compares_within_a_group_only():
@@ -324,28 +313,3 @@ def test_pruning_compares_within_a_group_only():
     prune = Prune(least_share=2e-3, group=lambda states: states[:, 0].astype(np.int32))
     moved = prune(KEY, mixture, mpfjax.Step(MODEL, jnp.float32(0.0)))
     assert moved.active.tolist() == [True, False, True, True]
-
-
-@pytest.mark.parametrize(("num_groups", "num_features"), [(3, 1), (12, 10)])
-def test_moments_of_groups_equal_those_of_numpy(num_groups, num_features):
-    features = RNG.normal(size=(300, num_features)) + 5
-    weights = RNG.random(300) * (RNG.random(300) < 0.8)
-    labels = RNG.integers(0, num_groups - 1, 300)  # the last group is empty
-    points = 5 + RNG.normal(size=(num_groups, num_features))
-    jitted = jnp.asarray(features), jnp.asarray(weights), jnp.asarray(labels)
-    two_passes = eqx.filter_jit(summarise)(*jitted, num_groups)
-    gaps = jnp.asarray(features - points[labels])
-    one_pass = eqx.filter_jit(summarise_about)(jnp.asarray(points), gaps, *jitted[1:])
-    for found in (two_passes, one_pass):
-        for group in range(num_groups - 1):
-            own = labels == group
-            mass = weights[own].sum()
-            mean = np.average(features[own], axis=0, weights=weights[own])
-            covariance = np.cov(features[own].T, aweights=weights[own], ddof=0).reshape(
-                num_features, num_features
-            )
-            np.testing.assert_allclose(found.masses[group], mass, rtol=1e-5)
-            np.testing.assert_allclose(found.means[group], mean, rtol=1e-5)
-            np.testing.assert_allclose(found.covariances[group], covariance, atol=1e-5)
-        for empty in (found.masses[-1], found.means[-1], found.covariances[-1]):
-            np.testing.assert_array_equal(empty, 0)

@@ -70,19 +70,30 @@ def read_states(path, **options):
     return np.where(grid.occupied, "#", np.where(grid.free, ".", "?"))[::-1].tolist()
 
 
-def test_sixteen_bits_are_as_eight(tmp_path):
-    expected = [["#", "?"], [".", "?"]]
-    assert read_states(written(tmp_path, GREYS)) == expected
-    assert read_states(written(tmp_path, GREYS.astype(np.uint16) * 257)) == expected
+READ, NEGATED = [["#", "?"], [".", "?"]], [[".", "#"], ["#", "?"]]
+# For ROS green and red are a third of white, and yellow two thirds, whatever an eye says.
+COLOURS = np.array([[[0, 255, 0], [255, 0, 0], [255, 255, 0], [255, 255, 255]]], np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "entries", "expected"),
+    [
+        (GREYS, {}, READ),
+        (GREYS.astype(np.uint16) * 257, {}, READ),
+        (GREYS, {"negate": "0"}, READ),
+        (GREYS, {"negate": False}, READ),
+        (GREYS, {"negate": "1"}, NEGATED),
+        (COLOURS, {}, [["#", "#", "?", "."]]),
+    ],
+)
+def test_pixels_are_read_whatever_their_kind(tmp_path, pixels, entries, expected):
+    assert read_states(written(tmp_path, pixels, **entries)) == expected
+
+
+def test_words_of_a_grey_map_have_their_high_byte_first(tmp_path):
     words = (GREYS.astype(">u2") * 257).tobytes()
     (tmp_path / "wide.pgm").write_bytes(b"P5\n2 2\n65535\n" + words)
-    assert read_states(tmp_path / "wide.pgm", resolution=0.05) == expected
-
-
-@pytest.mark.parametrize(("negate", "is_negated"), [("0", False), (False, False), ("1", True)])
-def test_negate_may_be_text(tmp_path, negate, is_negated):
-    expected = [[".", "#"], ["#", "?"]] if is_negated else [["#", "?"], [".", "?"]]
-    assert read_states(written(tmp_path, GREYS, negate=negate)) == expected
+    assert read_states(tmp_path / "wide.pgm", resolution=0.05) == READ
 
 
 def test_numbers_of_a_file_may_be_text(tmp_path):
@@ -93,12 +104,6 @@ def test_numbers_of_a_file_may_be_text(tmp_path):
     for name, value in (("resolution", "wide"), ("negate", "perhaps"), ("occupied_thresh", None)):
         with pytest.raises(ValueError, match=f"{name}: "):
             robots.read_map(written(tmp_path, GREYS, **{name: value}))
-
-
-def test_a_coloured_wall_is_the_mean_of_its_channels(tmp_path):
-    """For ROS green and red are a third of white, and yellow two thirds, whatever an eye says."""
-    pixels = np.array([[[0, 255, 0], [255, 0, 0], [255, 255, 0], [255, 255, 255]]], np.uint8)
-    assert read_states(written(tmp_path, pixels)) == [["#", "#", "?", "."]]
 
 
 def test_unknown_grey_that_becomes_free_is_a_warning(tmp_path):

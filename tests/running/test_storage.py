@@ -190,9 +190,9 @@ class TestFullDisk:
 class TestLongRuns:
     """The loop that `fit`, `maximise` and the samplers share, on a sum of 1, 2, ..."""
 
-    def go(self, path, last, stop=None, error=None, every=3, **settings):
+    def go(self, path, last, stop=None, error=None, **settings):
         """The rows and what stopped it; `error` comes where a step beyond `stop` is asked for."""
-        checkpoint = None if path is None else Checkpoint(path, every)
+        checkpoint = None if path is None else Checkpoint(path, 3)
         settings = {"start": 0} | settings
         run = LongRun("adding", last, checkpoint, False, lambda step: settings)
         start = State(0, np.array(0), np.zeros(0, int))
