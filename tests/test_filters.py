@@ -24,9 +24,6 @@ from tests.user_models import (
 KEY = jax.random.key(0)
 QUADRATIC = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
 OBSERVATIONS = jnp.array([1.5, 1.0, 0.4, 0.9])
-LINEAR = mpfjax.LinearGaussianModel(
-    A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.2]], m0=[0.5], P0=[[1.0]]
-)
 PF = CHAINS["pf"](QUADRATIC)
 
 
@@ -46,16 +43,6 @@ def test_a_start_is_what_its_parts_give_one_after_the_other():
     """To the last digit: the draws of x_0 are not part of the program that groups them."""
     filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(), 60, max_components=3)
     chex.assert_trees_all_equal(filter.init(KEY), filter._init(KEY))
-
-
-@pytest.mark.exactness
-def test_collect_decides_what_is_kept():
-    whole = mpfjax.run_filter(KEY, PF, OBSERVATIONS)
-    means = mpfjax.run_filter(KEY, PF, OBSERVATIONS, mean)
-    found = jax.vmap(mean)(whole.collected)
-    np.testing.assert_allclose(found, means.collected, rtol=1e-4, atol=1e-6)
-    last = jax.tree.map(lambda leaf: leaf[-1], whole.collected)
-    chex.assert_trees_all_equal(last, whole.final)
 
 
 @pytest.mark.exactness

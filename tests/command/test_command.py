@@ -340,18 +340,6 @@ def test_a_folder_of_detections_is_tracked_and_scored_without_pixels(alone, tmp_
     np.testing.assert_array_equal(found[0][found[0][:, 0] <= NUM_FRAMES], found[1])
 
 
-def test_a_late_clip_begins_at_its_first_row_and_a_far_row_is_named(tmp_path, capsys):
-    late = detected() + np.array([100_000, 0, 0, 0, 0, 0, 0])
-    assert run(write_detections(tmp_path / "late.txt", late), "--out", tmp_path, *SMALL) == 0
-    assert summary_in(tmp_path)["frames"] == NUM_FRAMES
-    assert read_tracks(tmp_path / "tracks.txt")[:, 0].min() > 100_000
-    far = write_detections(tmp_path / "far.txt", detected(), late)
-    for options in ([], ["--frames", "2:"]):
-        assert run(far, "--out", tmp_path / "far", *options, *SMALL) == 2
-        assert "detections: frame 100001 comes" in capsys.readouterr().err
-    assert not (tmp_path / "far").exists()
-
-
 @pytest.mark.parametrize(("options", "names"), [((), 2), (("--lost-seconds", 2), 1)])
 def test_classes_scores_and_seconds_go_through_to_what_is_written(tmp_path, options, names):
     """Two boxes of two classes; the second is away for a second and a half."""

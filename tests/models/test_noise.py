@@ -13,7 +13,7 @@ from scipy.stats import qmc
 
 from mpfjax.models.noise import draw_noise, stratified_uniform
 from mpfjax.moves.resampling.sorting import BITS, hilbert_index, order_by_key, sortable_bits
-from mpfjax.operations.random import direction_numbers, scramble, scrambled_directions, sobol_points
+from mpfjax.operations.random import direction_numbers, sobol_points
 
 # As one program each: to compile operations one by one takes longer.
 hilbert_index, order_by_key, sortable_bits = map(
@@ -62,29 +62,6 @@ def test_sobol_points_are_those_of_scipy():
     # scipy's are in the order of the Gray code.
     points = sobol_points(jnp.asarray(index ^ (index >> 1)), directions)
     np.testing.assert_array_equal(np.asarray(points).T / 2.0**32, expected)
-
-
-@pytest.mark.exactness
-def test_scrambling_permutes_the_cells_of_each_size():
-    """Points that share their first k digits still do, so that a net stays a net."""
-    m, d = 8, 3
-    plain = np.asarray(sobol_points(jnp.arange(2**m), jnp.asarray(direction_numbers(d, m))))
-    points = np.asarray(sobol_points(jnp.arange(2**m), scrambled_directions(KEYS[0], d, m)))
-    assert (points != plain).any(axis=1).all()
-    for k, both in itertools.product(range(1, m + 1), zip(plain, points, strict=True)):
-        cells = np.unique(np.stack(both) >> np.uint32(32 - k), axis=1)
-        assert cells.shape == (2, 2**k)
-
-
-def test_shuffled_indices_are_a_permutation_that_keeps_blocks_together():
-    seeds = jax.random.bits(jax.random.key(0), (50,), jnp.uint32)
-    num_digits, n = 10, 1 << 10
-    places = eqx.filter_jit(jax.vmap(lambda seed: scramble(jnp.arange(n), seed, num_digits)))
-    found = np.asarray(places(seeds)).astype(int)
-    np.testing.assert_array_equal(np.sort(found, axis=1), np.tile(np.arange(n), (50, 1)))
-    for k in range(num_digits):
-        blocks = (found >> k).reshape(50, -1, 1 << k)
-        assert (blocks == blocks[:, :, :1]).all()
 
 
 N = 30

@@ -468,24 +468,6 @@ def test_first_existences_are_those_of_a_grid():
 
 
 @pytest.mark.exactness
-def test_initial_objects_leave_no_weight_below_zero():
-    """Of products that a compiler may fuse."""
-    filter = mpfjax.bernoulli_filter(model(), 5000, 4)
-    scan = jnp.array([[0.3], [-0.8]])
-
-    def log_evidence(number):
-        mixture = filter.init(KEY)
-        targets = mixture.memory[TARGETS] | {"number": number}
-        mixture = mixture.replace(memory=mixture.memory | {TARGETS: targets})
-        moved, info = filter.step(KEY, mixture, scan)
-        return info.log_likelihood_increment, moved.log_weights
-
-    values, log_weights = jax.jit(jax.vmap(log_evidence))(jnp.linspace(0.1, 4, 10))
-    assert np.isfinite(values).all()
-    assert not np.isnan(log_weights).any()
-
-
-@pytest.mark.exactness
 @pytest.mark.parametrize("num_sensors", [1, 2])
 def test_detection_that_is_certain_or_never_happens(num_sensors):
     """Empty scans, their evidence and its derivative by p_D, and scans with measurements."""

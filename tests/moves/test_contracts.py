@@ -153,12 +153,3 @@ def new_counts(after, num_components):
     counts = (own & filled[..., None]).sum(axis=1)
     assert (counts == counts[:1]).all()
     return counts[0]
-
-
-@pytest.mark.exactness
-def test_resampling_works_with_any_pytree_of_particles():
-    leaves = {"box": ORDINARY.particles, "age": (jnp.arange(40), jnp.zeros((40, 2, 3)))}
-    move = Resample()
-    after = moved_by(move, jax.random.key(2), ORDINARY.replace(particles=leaves))
-    np.testing.assert_array_equal(after.particles["age"][0], after.ancestor_indices)
-    assert after.particles["age"][1].shape == (40, 2, 3)

@@ -8,7 +8,7 @@ import pytest
 
 from mpfjax.moves.resampling.sorting import order_by_segment
 from mpfjax.operations import prefix_sums
-from mpfjax.operations.logarithms import exp, finite_max, log_sum_exp, softmax
+from mpfjax.operations.logarithms import exp, log_sum_exp, softmax
 from mpfjax.operations.matrices import (
     cholesky,
     coordinates,
@@ -34,15 +34,11 @@ from mpfjax.operations.segments import (
     segment_max,
     segment_softmax,
     segment_sum,
-    segments_in_order,
     spread,
 )
 from mpfjax.operations.stored import (
     cond_if_any,
-    count_places,
     drawn_once,
-    select_rows,
-    take,
 )
 from tests.marking import quick_of
 
@@ -107,20 +103,6 @@ def test_counts_and_whole_numbers_are_exact_where_float32_is_not():
     counts = np.array([2**23 - 1, 1, 2**24, 1, 0, 3])
     found = count_upto(indices(counts), int(counts.sum()))
     np.testing.assert_array_equal(found, np.cumsum(counts))
-
-
-@pytest.mark.parametrize("n", [1, 7, 200])
-def test_count_starts_is_a_search_for_the_last_start(n):
-    starts = np.sort(RNG.integers(0, n + 3, n))
-    expected = np.searchsorted(starts, np.arange(n), side="right") - 1
-    np.testing.assert_array_equal(count_starts(indices(starts), n), expected)
-
-
-def test_places_are_counted_and_taken():
-    places = RNG.integers(0, 9, 20)
-    counts = count_places(indices(places), 9)
-    np.testing.assert_array_equal(counts, np.bincount(places, minlength=9))
-    np.testing.assert_array_equal(take(counts, indices(places)), np.asarray(counts)[places])
 
 
 # Segments.
@@ -188,14 +170,6 @@ def test_sums_of_segments_under_vmap_and_their_gradient(m, n, columns):
     np.testing.assert_array_equal(gradient[:, :, 0], np.where(inside, labels + 1, 0))
 
 
-@pytest.mark.parametrize("m", [1, 4, 33])
-def test_segments_side_by_side(m):
-    """An empty segment has no place; places after the last one belong to it."""
-    labels = np.sort(np.random.default_rng(m).choice([0, m - 1, m // 2], 100))
-    firsts = np.searchsorted(labels, np.arange(m))
-    np.testing.assert_array_equal(segments_in_order(indices(firsts), 100), labels)
-
-
 @pytest.mark.parametrize("m", [1, 5])
 def test_shares_have_a_finite_gradient_where_what_uses_them_has_none(m):
     values = np.array([0.3, -np.inf, -20.0, 1.2, -np.inf, 0.0], np.float32)
@@ -208,13 +182,6 @@ def test_shares_have_a_finite_gradient_where_what_uses_them_has_none(m):
 
 
 # Logarithms.
-
-
-def test_the_largest_logarithm_is_a_finite_constant():
-    nothing = ([-np.inf, -np.inf], [1.0, np.inf], [np.nan, 3.0], [])
-    for expected, values in ((1.5, [-2.0, 1.5]), *((0.0, values) for values in nothing)):
-        assert jax.jit(finite_max)(jnp.asarray(values, jnp.float32)) == expected
-    np.testing.assert_array_equal(jax.grad(finite_max)(jnp.array([1.0, 3.0, 2.0])), np.zeros(3))
 
 
 def test_exponentials_are_never_subnormal():
@@ -353,11 +320,3 @@ def test_draws_that_are_made_once_are_the_same_and_stay_one_branch():
     assert "cond[" in str(jax.make_jaxpr(together)(keys))
     scaled = lambda a: jnp.sum(drawn_once(keys[0], lambda key: a * jax.random.normal(key, (3,))))  # noqa: E731
     np.testing.assert_allclose(jax.grad(scaled)(2.0), scaled(1.0), rtol=1e-6)
-
-
-def test_rows_are_selected_whole_whatever_their_axes():
-    chosen, matrices = np.array([True, False, True]), RNG.normal(size=(3, 2, 4))
-    for new in (jnp.arange(1.0, 4.0), jnp.asarray(matrices)):
-        found = select_rows(jnp.asarray(chosen), new, -new)
-        np.testing.assert_array_equal(found[chosen], new[chosen])
-        np.testing.assert_array_equal(found[1], -new[1])

@@ -158,23 +158,6 @@ class TestOtherFiles:
         assert capsys.readouterr().out == said
         np.testing.assert_equal(results, alone[1])
 
-    def test_files_that_are_cut_off_or_foreign_are_named_and_only_their_cells_run_again(
-        self, alone, copy, tmp_path
-    ):
-        keys = jax.random.split(jax.random.key(1), 4)
-        run_study(small_study(NUM_CELLS, keys=keys), tmp_path / "other")
-        cut, foreign = files_of(copy)[1:3]
-        times = {path: path.stat().st_mtime_ns for path in files_of(copy)}
-        cut.write_bytes(cut.read_bytes()[:-200])
-        foreign.write_bytes((tmp_path / "other" / foreign.name).read_bytes())
-        for path, fault in ((cut, "cut off"), (foreign, "of another study")):
-            with pytest.raises(ValueError, match=f"{path.name}: {fault}"):
-                run_study(small_study(NUM_CELLS), copy, resume=True)
-            path.unlink()
-        np.testing.assert_equal(run_study(small_study(NUM_CELLS), copy, resume=True), alone[1])
-        again = [path for path, time in times.items() if path.stat().st_mtime_ns != time]
-        assert again == [cut, foreign]
-
 
 @pytest.mark.parametrize(
     ("changes", "named"),

@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.operations.random import split
-from mpfjax.smoothing import FixedLagSmoother, smoothed_sums
-from mpfjax.smoothing.sums import _advance
+from mpfjax.smoothing import FixedLagSmoother
 from tests.marking import weekly
 from tests.smoothing.test_trajectories import QUADRATIC, SQUARES
 
@@ -20,34 +18,6 @@ def test_no_lag_is_filtering_and_counts_are_averaged():
         window, (found,), _ = smoother.step(key, window, seen)
         moved = window.mixture
         np.testing.assert_allclose(found, moved.expectation(moved.particles > 1), rtol=1e-5)
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize("method", ["exact", *weekly(["mcmc"])])
-def test_a_lag_as_long_as_the_series_has_the_terms_of_the_sum(method):
-    """From the same start by the same keys."""
-    key, lag = jax.random.key(3), len(SQUARES) - 1
-    filter = mpfjax.mixture_particle_filter(QUADRATIC, 50, 2)
-
-    def function(before, after):
-        return {"x": after, "up": before < after}
-
-    whole = smoothed_sums(key, filter, SQUARES, function, method=method)
-    run = mpfjax.run_filter(key, filter, SQUARES)
-    np.testing.assert_array_equal(whole.run.final.particles, run.final.particles)
-    smoother = FixedLagSmoother(filter, function, lag, method)
-    window = smoother.init(whole.run.initial)
-    keys = [jax.random.split(own, len(SQUARES)) for own in split(key, 3)[1:]]
-    for t, (step_key, draw_key, seen) in enumerate(zip(*keys, SQUARES, strict=True)):
-        moved, _ = filter.step(step_key, window.mixture, seen)
-        window, estimates = _advance(smoother, draw_key, window, moved, None)
-        spreads = smoother.variances(window)
-        for name, sums in whole.sums.items():
-            assert np.isnan(estimates[name]).sum() == np.isnan(spreads[name]).sum() == lag - t
-            np.testing.assert_allclose(np.nansum(estimates[name]), sums[t], rtol=1e-5)
-    # An event has the variance p (1 - p).
-    chances = estimates["up"]
-    np.testing.assert_allclose(spreads["up"], chances * (1 - chances), atol=1e-5)
 
 
 @pytest.mark.exactness

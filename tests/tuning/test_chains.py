@@ -10,7 +10,6 @@ import mpfjax
 from mpfjax import Checkpoint
 from mpfjax.tuning import chains as chains_of
 from mpfjax.tuning import metropolis_hastings
-from mpfjax.tuning.densities import random_walk
 from tests.user_models import ScalarLinear
 
 COVARIANCE = np.array([[1.0, 0.9 * 0.05], [0.9 * 0.05, 0.05**2]])
@@ -66,28 +65,6 @@ class TestLearning:
             error = means.std(axis=0, ddof=1) / np.sqrt(len(means))
             assert (error < 0.05).all()
             assert (np.abs(means.mean(axis=0)) < 4 * error).all()
-
-    def test_it_is_that_of_the_papers(self):
-        """The recursion, written for one chain and one number at a time."""
-        rng = np.random.default_rng(0)
-        points = rng.normal(size=(4, 3, 2))
-        reals = {"a": jnp.asarray(points[0, :, 0]), "b": jnp.asarray(points[0, :, 1])}
-        walk = random_walk({"a": jnp.asarray(0.3), "b": jnp.asarray(0.7)}, reals)
-        mean, log_scale = points[0].mean(axis=0), 0.0
-        covariance = np.diag([0.3**2, 0.7**2]) * 2 / 2.38**2
-        np.testing.assert_allclose(walk.factor, np.diag([0.3, 0.7]), rtol=1e-6)
-        for step in range(3):
-            gain = (step + 2) ** -0.6
-            spread = np.mean([np.outer(x - mean, x - mean) for x in points[step + 1]], axis=0)
-            mean = mean + gain * (points[step + 1].mean(axis=0) - mean)
-            covariance = covariance + gain * (spread - covariance)
-            log_scale += gain * (0.5 - 0.234)
-            new = jnp.asarray(points[step + 1], jnp.float32)
-            walk = walk.adapted(new, jnp.asarray(step), jnp.asarray(0.5))
-        proposed = walk.factor @ walk.factor.T
-        np.testing.assert_allclose(
-            proposed, np.exp(2 * log_scale) * 2.38**2 / 2 * covariance, rtol=1e-4
-        )
 
 
 WHOLE = {"burn_in": 9, "sample_prior": dispersed}

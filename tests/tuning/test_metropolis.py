@@ -30,15 +30,6 @@ def sample(num_steps=5, *, filter=FILTER, **options):
     return metropolis_hastings(jax.random.key(0), filter, OBSERVATIONS, num_steps, **options)
 
 
-@pytest.mark.weekly
-def test_likelihoods_are_those_of_the_states():
-    """They change when, and only when, a step moves."""
-    run = sample(30, num_chains=3)
-    moved = np.diff(run.log_marginal_likelihoods, axis=1) != 0
-    np.testing.assert_array_equal(np.diff(run.parameters["a"], axis=1) != 0, moved)
-    np.testing.assert_array_equal(run.accepted[:, 1:], moved)
-
-
 class Breaking(ScalarLinear):
     """A likelihood that breaks where r is above 2, and is 1 elsewhere."""
 

@@ -309,11 +309,6 @@ class TestAnyObjective:
         np.testing.assert_allclose(run.history["r"][:2], [1.0, 1.4], rtol=1e-5)
         assert run.value == pytest.approx(0.0, abs=1e-4)
 
-    def test_it_goes_on_from_a_checkpoint(self, tmp_path):
-        checkpoint = Checkpoint(tmp_path / "ascent.npz")
-        self.ascent(3, checkpoint=checkpoint)
-        assert_same(self.ascent(6, checkpoint=checkpoint), self.ascent(6))
-
     def test_it_is_averaged_over_seeds(self):
         run = self.ascent(30, noise=1.0, num_seeds=200)
         assert np.abs(run.history["deviation"] - 1.0).max() < 0.25  # five standard errors

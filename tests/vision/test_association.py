@@ -2,18 +2,14 @@
 
 import itertools
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.vision.colour import bhattacharyya
 from mpfjax.vision.tracking.associate import (
-    learned_descriptors,
     mahalanobis,
     marginals,
     one_to_one,
     probabilities,
-    unlikeness,
 )
 from mpfjax.vision.tracking.gaussian import Gaussian, overlapping
 from mpfjax.vision.tracking.pairs import Pairs
@@ -134,24 +130,6 @@ def test_a_very_wide_prediction_still_forms_a_pair_with_what_lies_at_it():
     assert mahalanobis(wide, np.zeros(4) + 0.1, place, np.zeros((1, 1))).values[0] < 0
 
 
-def test_colours_cost_by_their_distance_and_nothing_where_they_are_not_known():
-    rng = np.random.default_rng(0)
-    known, seen = (rng.dirichlet(np.ones(5), (n, 3)) for n in (2, 4))
-    known[1] = 0
-    cost = unlikeness(seen.reshape(4, 15), known.reshape(2, 15))
-    squares = np.mean(bhattacharyya(jnp.asarray(seen)[None], jnp.asarray(known)[:, None]), axis=2)
-    np.testing.assert_allclose(cost[0], 14 * (squares[0] - 0.25), rtol=1e-4)
-    np.testing.assert_array_equal(cost[1], np.zeros(4))
-
-
-def test_colours_are_learned_from_who_stands_alone():
-    known = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
-    seen = np.array([[0.0, 1.0], [0.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
-    alone = np.array([False, True, False, True])
-    after = learned_descriptors(known, seen, alone)
-    np.testing.assert_allclose(after, [[0, 1], [0.86, 0.14], [1, 0], [1, 0]], rtol=1e-6)
-
-
 def test_overlap_is_the_share_of_pixels():
     a, b = np.array([[10, 10, 8, 4], [30, 30, 2, 2]]), np.array([[12, 11, 8, 4]])
     grid = np.stack(np.meshgrid(np.arange(60), np.arange(60)), axis=-1) + 0.5
@@ -159,18 +137,3 @@ def test_overlap_is_the_share_of_pixels():
     expected = [[(one & inside[2]).sum() / (one | inside[2]).sum()] for one in inside[:2]]
     shares = matrix(overlapping(1.0 * a, 1.0 * b, 0.0), 0.0)
     np.testing.assert_allclose(shares, expected, rtol=1e-12)
-
-
-def test_partners_have_each_others_largest_value_above_zero():
-    """Against a search of the whole matrix, in which some pairs are impossible."""
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        values = rng.normal(0.5, 1, (6, 4))
-        values[rng.uniform(size=values.shape) < 0.4] = -np.inf
-        columns = np.argmax(values, axis=1)
-        best = values[np.arange(6), columns]
-        is_mutual = (np.argmax(values, axis=0)[columns] == np.arange(6)) & (best > 0)
-        expected = np.where(is_mutual, columns, -1)
-        np.testing.assert_array_equal(possible(values).partners, expected)
-    nobody = Pairs.of(np.zeros((2, 0)), np.zeros((2, 0), bool))
-    assert nobody.partners.tolist() == [-1, -1]

@@ -8,9 +8,9 @@ import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.vision import ObjectTracker
 from mpfjax.vision.tracking.camera import CameraState
-from mpfjax.vision.tracking.gaussian import Gaussian, units
+from mpfjax.vision.tracking.gaussian import Gaussian
 from mpfjax.vision.tracking.lives import Coasting, Duplicates, Spans
-from mpfjax.vision.tracking.noise import _GRID, NoiseState
+from mpfjax.vision.tracking.noise import NoiseState
 from mpfjax.vision.tracking.pairs import Pairs
 from mpfjax.vision.tracking.scores import ScoreState
 
@@ -88,26 +88,6 @@ def test_who_moves_at_random_is_not_taken_for_a_bad_detector(turn, rate, least):
     assert (noises.velocity[2:] < 0.6 * least).all()
 
 
-def test_each_candidate_is_a_filter_of_its_own_from_the_first_detection_on():
-    """Of a box that doubles in eight frames: candidates differ in its size, their unit."""
-    rng, speed = np.random.default_rng(0), np.array([0.1, 0.05, 0.05, 0.03])
-    seen = np.array([30.0, 60, 3, 3.5]) + np.arange(9)[:, None] * [1, 2, 0.09, 0.08]
-    seen += rng.normal(0, 0.05, seen.shape) * [2, 2, 1, 1]
-    state = NoiseState.initial(25.0, 4).renew(np.zeros(0, bool), seen[:1], speed)
-    for row in seen[1:]:
-        about = np.zeros(1, int), row[None], np.ones(1, bool), Gaussian.none(4)
-        state = state.predict(1.0).after(*about)
-    expected = []
-    for error, place, velocity in _GRID:
-        now = Gaussian.initial(seen[:1], units(seen[:1]) * error, units(seen[:1]) * speed)
-        for row in seen[1:]:
-            now = now.predict(np.full(4, place), np.full(4, velocity), now.unit, 1.0)
-            now = now.update(row[None], now.unit * error)[0]
-        expected.append(now.place[0])
-    assert np.ptp(np.array(expected)[:, 2]) > 0.1
-    np.testing.assert_allclose(state.moments.place[0], expected, rtol=1e-12)
-
-
 def test_of_many_objects_the_eldest_tell_the_noises_and_others_follow_when_they_end():
     rng, speed = np.random.default_rng(0), np.full(4, 0.1)
     places = rng.uniform(1, 3, (300, 4))
@@ -126,21 +106,6 @@ def test_of_many_objects_the_eldest_tell_the_noises_and_others_follow_when_they_
 
 
 # --- the camera ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("sigma", [0.02, 0.2])
-@pytest.mark.parametrize("num_objects", [2, 8])
-def test_the_mean_product_of_innovations_is_the_cameras_variance(sigma, num_objects):
-    """Objects err on their own by a tenth of a box, which is not the camera's motion."""
-    rng, camera, squares = np.random.default_rng(0), CameraState(), []
-    variances = np.full((num_objects, 2), 0.02 + 0.1**2)
-    for _ in range(600):
-        gaps = rng.normal(0, sigma, 2) + rng.normal(0, 0.1, (num_objects, 2))
-        camera, _ = camera.after(gaps, variances, 0 * gaps, False, np.ones(2))
-        squares.append(camera.deviations**2)
-    # The mean of a few hundred products, of which a thirtieth is forgotten in each frame.
-    learned = np.sqrt(np.mean(squares[200:]))
-    assert learned == pytest.approx(sigma, rel=0.35 if sigma > 0.1 else 1.2)
 
 
 def test_a_shift_of_all_is_the_cameras_and_that_of_one_is_its_own():
@@ -175,27 +140,12 @@ def test_scores_of_chains_that_become_sure_are_strong_and_of_those_that_end_are_
     assert float(scored(far, lasting=50).strong) < 0.35
 
 
-def test_a_chain_follows_what_leaves_its_box_in_a_frame():
-    """It speeds up to one and a half boxes a frame, and is missed once."""
-    step = np.minimum(1.5 * np.arange(40), 15)
-    frames = [[((5 + x, 5),), [1.0]] for x in np.cumsum(step)]
-    frames[30] = [((900, 900),), [1.0]]  # another one
-    assert scored(frames, lasting=1000).age.max() == 40
-
-
 def test_what_an_empty_street_leaves_does_not_become_sure():
     """An object of score 6 is there for three seconds; then false detections alone, of up to 2."""
     rng = np.random.default_rng(0)
     there = [[((5, 5), tuple(rng.uniform(100, 900, 2))), [6.0, 1.0]] for _ in range(75)]
     empty = [[rng.uniform(100, 900, (2, 2)), rng.uniform(0, 2, 2)] for _ in range(250)]
     assert float(scored([*there, *empty]).strong) > 2
-
-
-@pytest.mark.parametrize("score", [-2.0, 0.3, 7.0])
-def test_equal_scores_are_all_strong(score):
-    state = scored([[((5, 5), (50, 50)), [score, score]]] * 200)
-    assert float(state.strong) <= score
-    assert float(state.weak) <= score
 
 
 def test_predictions_are_shown_for_as_long_as_they_were_right():

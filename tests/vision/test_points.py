@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from mpfjax.vision import Detections, ObjectTracker, track
-from mpfjax.vision.tracking.associate import Likeness, cosine_distances
 from mpfjax.vision.tracking.track import online_rows
 from tests.marking import weekly
 
@@ -75,17 +74,3 @@ def right_after_a_meeting(crosses, with_vectors, seed):
 def test_look_alikes_in_motion_are_told_apart_by_their_vectors(with_vectors):
     kept = [right_after_a_meeting(way, with_vectors, seed) for way in (0, 1) for seed in range(4)]
     assert all(kept) == with_vectors
-
-
-def test_the_weight_of_vectors_is_the_odds_of_their_distances():
-    rng = np.random.default_rng(0)
-    distances = np.stack([rng.normal(0.2, 0.1, 500), rng.normal(0.8, 0.1, 500)], axis=1)
-    same = np.tile([True, False], (500, 1))
-    cost = Likeness().after(distances, same).cost(np.array([[0.5, 0.45, np.nan, 9.0]]))
-    # -2 log of the odds of N(.2, .1²) to N(.8, .1²), with .001 added to the variance
-    np.testing.assert_allclose(cost[0, 1], -2 * 0.6 / 0.011 * 0.05, rtol=0.1)
-    np.testing.assert_allclose(cost[0, [0, 2, 3]], [0, 0, 8], atol=1.0)
-    alike = Likeness().after(distances, ~same & False).cost(distances)
-    np.testing.assert_array_equal(alike, 0 * distances)
-    unknown = cosine_distances(np.array([[0.0, 0.0], [3.0, 4.0]]), np.array([[6.0, 8.0]]))
-    np.testing.assert_allclose(unknown, [[np.nan], [0]], atol=1e-12)
