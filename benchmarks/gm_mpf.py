@@ -285,7 +285,7 @@ def times_of(runs: dict[str, Callable[[int], Any]], timed: int) -> list[dict[str
 
 
 def draw_migration(fewest: dict[str, Step], targets: Targets) -> Any:
-    """Figures 1 and 2: where the particles of one run are, coloured by the target they stand for.
+    """Figures 1 and 2: where the particles of one run are, in the colour of their target.
 
     Four frames, among them the first, the one in which the targets are closest, and the last,
     cropped to where both are.
@@ -302,7 +302,7 @@ def draw_migration(fewest: dict[str, Step], targets: Targets) -> Any:
         if name != "gpf"
     ]
     titles = [f"frame {targets.first + t}" for t in chosen]
-    legend = {f"particles that stand for target {k + 1}": k for k in (0, 1)}
+    legend = {f"particles of target {k + 1}": k for k in (0, 1)}
     return plotting.draw_contact_sheet(columns, titles, legend)
 
 

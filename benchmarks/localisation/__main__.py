@@ -220,8 +220,8 @@ def picture(rows: list[dict[str, Any]]) -> Any:
                 steps = np.arange(1, len(share) + 1)
                 points = zip(steps, share, share - error, share + error, strict=True)
                 lines[row["filter"]] = [*points]
-        title = f"{name}; carried away after {carried} scans"
-        share = "share of runs at the true pose"
+        title = f"{name}: moved after {carried} scans"
+        share = "fraction of runs at the true pose"
         return plotting.Panel(title, "time (scans)", share, lines, (-0.03, 1.03), carried)
 
     panels = [panel(name) for name in dict.fromkeys(row["scene"] for row in rows)]

@@ -191,10 +191,12 @@ def picture(rows: list[dict[str, Any]]) -> Any:
     def panel(scene: str, what: str, label: str) -> plotting.Panel:
         scene_rows = [row for row in rows if row["scene"] == scene]
         ends = (lambda row, k=k: row[what] + k * row[what + "_error"] for k in (-2, 2))
-        lines = plotting.lines_of(scene_rows, "N = {N}, ± 2 s.e.".format_map, "filter", what, *ends)
+        lines = plotting.lines_of(
+            scene_rows, "N = {N}, ± 2 standard errors".format_map, "filter", what, *ends
+        )
         return plotting.Panel(scene, label, "", lines, (0, None))
 
-    measures = {"mass_rmse": "RMSE of the masses", "log_z_rmse": r"RMSE of $\log \hat{Z}$"}
+    measures = {"mass_rmse": "RMSE of the mixture weights", "log_z_rmse": r"RMSE of $\log \hat{Z}$"}
     scenes = dict.fromkeys(row["scene"] for row in rows)
     return plotting.draw_dots([[panel(s, *each) for s in scenes] for each in measures.items()], 2.7)
 

@@ -175,7 +175,8 @@ def _picture(truth: np.ndarray, plots: np.ndarray, found: Found) -> Any:
 
     figure = Figure((10, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
-    left.plot(*plots.reshape(-1, 2).T, ".", color="0.8", markersize=1, zorder=0, label="plots")
+    marks: Any = {"color": "0.7", "markersize": 1, "zorder": 0, "label": "measurements"}
+    left.plot(*plots.reshape(-1, 2).T, ".", **marks)
     there, is_there = told(truth)
     for k in range(there.shape[1]):
         path = there[is_there[:, k], k].T
@@ -192,9 +193,9 @@ def _picture(truth: np.ndarray, plots: np.ndarray, found: Found) -> Any:
 
     shares = np.cumsum(jax.vmap(mpfjax.number_distribution)(jnp.asarray(found.existence)), axis=1)
     low, high = ((shares < q).sum(axis=1) for q in (0.1, 0.9))
-    right.fill_between(steps, low, high, color="C0", alpha=0.3, linewidth=0, step="mid")
+    right.fill_between(steps, low, high, color=COLOURS[0], alpha=0.3, linewidth=0, step="mid")
     right.step(steps, is_there.sum(axis=1), color="k", where="mid", label="true")
-    right.plot(steps, found.expected, color="C0", label="expected, and 10 to 90%")
+    right.plot(steps, found.expected, color=COLOURS[0], label="expected, 10 to 90%")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2, frameon=False)
     right.set(xlabel="scan", ylabel="number of objects", ylim=(0, None))
     return figure
