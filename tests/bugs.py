@@ -104,8 +104,8 @@ BUGS = {
         "tests/metrics/test_set_distances.py -k ospa",
     ),
     "objects move against the camera": Bug(
-        "objects = state.objects.shift(shift)",
-        "objects = state.objects.shift(-shift)",
+        "objects = state.objects.shift(shift, faster)",
+        "objects = state.objects.shift(-shift, faster)",
         "tests/vision/test_tracker.py -k shaking",
     ),
     # Propagation, several objects, look-aheads.

@@ -340,3 +340,16 @@ def test_still_objects_before_a_shaking_camera_are_shown_and_keep_their_names(sh
             found = boxes, np.array([1, 1, 0.6, 0.6])
             state, tracks = EIGHT.step(None, state, None, found, told)
             assert tracks.shown.sum() == tracks.identities.max() == 4
+
+
+def test_velocities_end_with_the_pan_that_all_objects_followed():
+    """Otherwise the camera's shift makes up for them, and who is detected alone is lost."""
+    at, state = np.array([[150, 150], [350, 160], [200, 350], [420, 340]]), EIGHT.init()
+    rng, places = np.random.default_rng(0), np.cumsum([12.0] * 40 + [0.0] * 25)
+    for t, place in enumerate(places):
+        corners = at + np.array([place, 0]) + rng.normal(0, 1, (4, 2))
+        boxes = np.concatenate([corners, 0 * at + 40], axis=1)
+        state, tracks = EIGHT.step(None, state, None, boxes[: 1 if t >= 60 else 4])
+    assert np.abs(state.objects.velocity[0, 0]) < 1
+    assert tracks.identities.max() == 4
+    assert tracks.shown[0]

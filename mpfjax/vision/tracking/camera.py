@@ -24,11 +24,26 @@ class CameraState(NamedTuple):
 
     - `deviations`: of all of it; `left`: of what the pixels do not tell.
     - `weight`: how many frames of many objects they are the means of.
+    - `shift`: the latest, in boxes; `squares`, `products`: means over time of its square, and of
+      its product with the shift before.
     """
 
     deviations: Pair = np.full(2, _STILL)
     left: Pair = np.full(2, _STILL)
     weight: float = _PRIOR
+    shift: Pair = np.zeros(2)
+    squares: Pair = np.full(2, _STILL**2)
+    products: Pair = np.zeros(2)
+
+    @property
+    def steady(self) -> Pair:
+        """The share of a shift that the next one repeats: the correlation of successive shifts.
+
+        A camera that pans gives all objects a velocity. When it stops, the shift makes up for that
+        velocity in each frame, the innovations are zero, and nothing would correct the two: this
+        share of the shift is added to the velocities.
+        """
+        return np.clip(self.products / self.squares, 0.0, 1.0)
 
     def after(
         self, gaps: Gaps, variances: Gaps, displacements: Gaps, is_known: bool, box: Pair
@@ -56,7 +71,12 @@ class CameraState(NamedTuple):
         weight = min(self.weight + information, 1 / _RATE)
         deviations = _learn(self.deviations, (gaps + displacements) / box, information / weight)
         left = _learn(self.left, gaps / box, information / weight) if is_known else self.left
-        return CameraState(deviations, left, weight), shift
+        now = shift / box
+        squares, products = (
+            (1 - _RATE) * mean + _RATE * now * other
+            for mean, other in ((self.squares, now), (self.products, self.shift))
+        )
+        return CameraState(deviations, left, weight, now, squares, products), shift
 
 
 def find_jolt(

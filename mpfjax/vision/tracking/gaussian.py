@@ -13,6 +13,7 @@ from mpfjax.vision.tracking.pairs import Pairs, intervals
 
 # The share of a size's growth rate that is left after a frame.
 _GROWTH_KEPT = 0.9
+_STILL = np.zeros(2)
 _FURTHER = np.log(20)  # a distance beyond which one in twenty is, as -log of its probability
 # A number for each object and coordinate, or fewer that broadcast to these.
 Numbers = Float[np.ndarray, "*#n #k"]
@@ -93,9 +94,12 @@ class Gaussian(NamedTuple):
             var_velocity=mixed.var_velocity + between * away_velocity**2,
         )
 
-    def shift(self, shift: Float[np.ndarray, "2"]) -> "Gaussian":
-        """The moments of what has been moved by (x, y)."""
-        return self._replace(place=self.place + along(self.place, shift))
+    def shift(
+        self, shift: Float[np.ndarray, "2"], faster: Float[np.ndarray, "2"] = _STILL
+    ) -> "Gaussian":
+        """The moments of what has been moved by (x, y), and is so much `faster`."""
+        velocity = self.velocity + along(self.place, faster)
+        return self._replace(place=self.place + along(self.place, shift), velocity=velocity)
 
     def at(self, rows: np.ndarray) -> "Gaussian":
         """The moments of some rows."""

@@ -205,9 +205,9 @@ def _with_camera(
     variances = (objects.var_place + (objects.unit * errors) ** 2)[rows, :2]
     box = np.exp(objects.place[confirmed, 2:].sum(axis=0) / max(confirmed.sum(), 1))
     camera, shift = state.camera.after(gaps, variances, (displacements + jolt)[rows], is_known, box)
-    shift = jolt + shift
-    noise = state.noise._replace(moments=state.noise.moments.shift(shift))
-    objects = state.objects.shift(shift)
+    faster, shift = camera.steady * shift / frame.frames, jolt + shift
+    noise = state.noise._replace(moments=state.noise.moments.shift(shift, faster))
+    objects = state.objects.shift(shift, faster)
     return state._replace(objects=objects, noise=noise, camera=camera), shift
 
 
