@@ -353,3 +353,12 @@ def test_velocities_end_with_the_pan_that_all_objects_followed():
     assert np.abs(state.objects.velocity[0, 0]) < 1
     assert tracks.identities.max() == 4
     assert tracks.shown[0]
+
+
+def test_a_jolt_is_told_by_those_known_for_long_whatever_becomes_of_a_newcomer():
+    """Two objects jump by half a box; a third, of three frames, has no detection since."""
+    at, state = np.array([[150, 150], [350, 160], [200, 350]]), EIGHT.init()
+    for t in range(30):
+        boxes = np.concatenate([at + np.array([0, 20 * (t >= 27)]), 0 * at + 40], axis=1)
+        state, tracks = EIGHT.step(None, state, None, boxes[: 3 if 24 <= t < 27 else 2])
+    assert tracks.identities.tolist() == [1, 2, 3]

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from mpfjax.vision.tracking.associate import mahalanobis
 from mpfjax.vision.tracking.gaussian import Gaussian
+from mpfjax.vision.tracking.pairs import Integers
 
 _FREEDOM = 4.0  # degrees, of Student's distribution of what objects do on their own
 _ROUNDS = 5
@@ -80,29 +81,37 @@ class CameraState(NamedTuple):
 
 
 def find_jolt(
-    objects: Gaussian, errors: Sides, places: Float[np.ndarray, "d 4"], unlike: Costs, num_near: int
+    objects: Gaussian,
+    ages: Integers,
+    errors: Sides,
+    places: Float[np.ndarray, "d 4"],
+    unlike: Costs,
+    num_near: int,
 ) -> Pair:
     """The shift of a jolt that leaves most objects without a detection, zero if there was none.
 
-    `objects` were detected lately, the longest known first, and `num_near` of them, at most half,
-    have a detection near them; `unlike` is what pairs cost beside distance. The shifts that bring
-    one of the eight longest known to one of the two detections next to it are tried: a camera moves
-    all by the same. The one that explains most counts, if that is three quarters of them, and two
-    more than without it.
+    `objects` were detected lately, the longest known first, each in so many frames (`ages`). At
+    most half of them, `num_near`, have a detection near them; `unlike` is what pairs cost beside
+    distance. The shifts that bring one of the eight longest known to one of the two detections next
+    to it are tried: a camera moves all by the same. The one that explains most frames counts, if it
+    explains three quarters of them, and two objects more than none does.
     """
 
-    def count_explained(shift: np.ndarray) -> int:
+    def ages_near(shift: np.ndarray) -> Integers:
         cost = mahalanobis(objects.shift(shift), errors, places, unlike)
-        return len(np.unique(cost.rows[cost.values < 0]))
+        return ages[np.unique(cost.rows[cost.values < 0])]
 
     gaps = places[None, :, :2] - objects.place[:_LEADERS, None, :2]
     far = np.sum((gaps / objects.unit[:_LEADERS, None, :2]) ** 2, axis=2) + unlike[:_LEADERS]
     nearest = np.argsort(far, axis=1, kind="stable")[:, :_NEAREST]
     shifts = np.take_along_axis(gaps, nearest[..., None], axis=1).reshape(-1, 2)
-    numbers = np.array([count_explained(shift) for shift in shifts])
-    best = int(np.argmax(numbers)) if len(numbers) else 0
-    least = max(num_near + 2, 0.75 * len(objects.place))
-    return shifts[best] if len(numbers) and numbers[best] >= least else np.zeros(2)
+    most, best = np.zeros(0, int), np.zeros(2)
+    for shift in shifts:
+        near = ages_near(shift)
+        if near.sum() > most.sum():
+            most, best = near, shift
+    is_jolt = most.sum() >= 0.75 * ages.sum() and len(most) >= num_near + 2
+    return best if is_jolt else np.zeros(2)
 
 
 def _learn(deviations: Pair, gaps: Gaps, rate: float) -> Pair:

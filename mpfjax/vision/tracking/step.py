@@ -221,7 +221,8 @@ def _jolt(state: TrackerState, frame: _Frame, cost: Pairs) -> Float[np.ndarray, 
     if 2 * num_near > len(lately) or len(lately) < num_near + 2:
         return np.zeros(2)
     errors, unlike = state.noise.noises.errors, frame.costs[np.ix_(lately, counts)]
-    return find_jolt(state.objects.at(lately), errors, frame.places[counts], unlike, num_near)
+    about = errors, frame.places[counts], unlike, num_near
+    return find_jolt(state.objects.at(lately), lives.num_strong[lately], *about)
 
 
 def _judge(
