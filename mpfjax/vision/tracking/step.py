@@ -192,9 +192,9 @@ def _with_camera(
         return state, np.zeros(2)
     errors, confirmed = state.noise.noises.errors, state.lives.confirmed
     cost = associate.mahalanobis(state.objects, errors, frame.places, frame.costs)
-    jolt = _jolt(state, frame, cost)
-    objects = state.objects.shift(jolt)
+    jolt, objects = _jolt(state, frame, cost), state.objects
     if jolt.any():
+        objects = objects.shift(jolt)
         cost = associate.mahalanobis(objects, errors, frame.places, frame.costs)
     # An object and a detection tell the motion if each has its least cost with the other.
     strong = frame.detections.scores >= state.scores.strong
