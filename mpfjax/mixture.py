@@ -31,7 +31,6 @@ from mpfjax.operations.logarithms import (
 )
 from mpfjax.operations.prefix_sums import sum_before
 from mpfjax.operations.segments import (
-    segment_any,
     segment_counts,
     segment_log_sum_exp,
     segment_softmax,
@@ -188,10 +187,7 @@ class ParticleMixture(eqx.Module):
     @property
     def active(self) -> Bool[Array, " m"]:
         """Which components have particles."""
-        self._require_one()
-        if self.num_components == 1:
-            return jnp.any(self.occupied)[None]
-        return segment_any(self.occupied, self.component_indicators, self.num_components)
+        return self.component_counts > 0
 
     @property
     def component_weights(self) -> Float[Array, " n"]:

@@ -11,21 +11,16 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mpfjax.operations.logarithms import (
+    add_gradient,
     default_float,
     exp,
     finite_or_zero,
     log_or_nothing,
 )
-from mpfjax.operations.prefix_sums import count_starts
-from mpfjax.operations.stored import (
-    EXACT_IN_FLOAT32,
-    stored,
-    take,
-)
+from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored, take
 
 # Up to this many segments, a sum has a mask for each; with more, up to this many masked entries.
 # Masks run on vectors, and compile in half the time of a scatter. Runs of a `vmap` multiply them.
@@ -41,9 +36,6 @@ _LANES = 8
 _FEW_COLUMNS = 9
 # In float32, a million equal numbers, added one after the other, give a thousandth too much.
 _LONGEST_SUM = 2**10
-# The segments that occur are kept in the bits of at most this many words.
-_WORD, _MOST_WORDS = 32, 8
-_WORD_BITS = 5  # a word has 2^5 bits
 _REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
 
 
@@ -101,25 +93,6 @@ def segment_max(
     return segment_reduce("max", values, segments, num_segments, -jnp.inf)
 
 
-@partial(jax.jit, static_argnames="num_segments")
-def segment_any(
-    mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
-) -> Bool[Array, " num_segments"]:
-    """Which segments have a masked entry; labels are in [0, num_segments)."""
-    if num_segments > _MOST_WORDS * _WORD:
-        return _scatter("max", mask.astype(jnp.int32), segments, num_segments, 0) > 0
-    word_of, bit = segments >> _WORD_BITS, (segments & (_WORD - 1)).astype(jnp.uint32)
-    bits = jnp.uint32(1) << bit
-    words = []
-    for word in range(-(-num_segments // _WORD)):
-        of_word = jnp.where(mask & (word_of == word), bits, jnp.uint32(0))
-        words.append(jax.lax.reduce(of_word, np.uint32(0), jax.lax.bitwise_or, (0,)))
-    # Not gathered by label: XLA would read all particles again for each.
-    shifts = jnp.arange(_WORD, dtype=jnp.uint32)
-    occurs = (jnp.stack(words)[:, None] >> shifts[None]) & 1 > 0
-    return occurs.reshape(-1)[:num_segments]
-
-
 def segment_reduce(
     how: str,
     values: Shaped[Array, " n"],
@@ -132,9 +105,11 @@ def segment_reduce(
     Of these the sum has a derivative.
     """
     if not are_masked(len(values), num_segments):
-        if how == "add":
-            return _scattered_sum(values, segments, num_segments)
-        return _scatter(how, values, segments, num_segments, nothing)
+        if how != "add":
+            return _scatter(how, values, segments, num_segments, nothing)
+        sums = _scatter(how, stored(values), segments, num_segments, 0)
+        # The form of JAX itself, whose derivative can be transposed.
+        return add_gradient(sums, jax.ops.segment_sum(values, segments, num_segments))
     # XLA fuses the masks into the sum and never stores them.
     is_member = segments[None] == jnp.arange(num_segments, dtype=segments.dtype)[:, None]
     of_each = jnp.where(is_member, values[None], nothing)
@@ -149,21 +124,6 @@ def segment_counts(
     if mask.shape[0] >= EXACT_IN_FLOAT32:
         return _scatter("add", mask.astype(jnp.int32), segments, num_segments, 0)
     return segment_sum(mask.astype(default_float()), segments, num_segments).astype(jnp.int32)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _scattered_sum(
-    values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
-) -> Float[Array, " num_segments"]:
-    return _scatter("add", stored(values), segments, num_segments, 0)
-
-
-@_scattered_sum.defjvp
-def _scattered_sum_jvp(num_segments: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    values, segments = primals
-    # The form of JAX itself, which can be transposed.
-    tangent = jax.ops.segment_sum(tangents[0], segments, num_segments)
-    return _scattered_sum(values, segments, num_segments), tangent
 
 
 def _scatter(
@@ -242,18 +202,3 @@ def first_places(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " 
     """The first index with each segment's label, n - 1 for a label that does not occur."""
     n = segments.shape[0]
     return segment_reduce("min", jnp.arange(n, dtype=jnp.int32), segments, num_segments, n - 1)
-
-
-def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, " num_places"]:
-    """The segment of each place, if segments lie side by side and `firsts` are their first places.
-
-    An empty segment has no place. Places after the last segment belong to the last one.
-    """
-    num_segments = firsts.shape[0]
-    if num_segments > FEW_SEGMENTS:
-        return count_starts(firsts, num_places)
-    place = jnp.arange(num_places, dtype=jnp.int32)
-    segments = jnp.zeros(num_places, jnp.int32)
-    for m in range(1, num_segments):
-        segments = segments + (place >= firsts[m]).astype(jnp.int32)
-    return segments

@@ -7,7 +7,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.logarithms import scaled_exp
-from mpfjax.operations.segments import segments_in_order, spread
+from mpfjax.operations.prefix_sums import count_starts
+from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import stored
 
 # Bounds of the share of the slots that is shared equally: the variance of Ẑ is then at most
@@ -116,7 +117,7 @@ def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
     """The slots of each component, given their number for each."""
     firsts = jnp.cumsum(targets, dtype=jnp.int32) - targets
     slot = jnp.arange(num_particles, dtype=jnp.int32)
-    components = segments_in_order(firsts, num_particles)
+    components = count_starts(firsts, num_particles)
     return Slots(
         components=components,
         ranks=slot - spread(firsts, components),
