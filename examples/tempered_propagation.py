@@ -17,7 +17,7 @@ import mpfjax
 from mpfjax import ParticleMixture, Resample, Step
 from mpfjax.exact import grid_filter
 from mpfjax.models.base import require_noise
-from mpfjax.moves.base import AbstractPropagation, AbstractWrapper, is_missing
+from mpfjax.moves.base import AbstractPropagation, AbstractWrapper
 from mpfjax.moves.propagation.propagate import predict
 
 
@@ -54,7 +54,7 @@ class PropagateTempered(AbstractPropagation, AbstractWrapper):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t, stage by stage."""
-        if is_missing(now):
+        if now.is_missing:
             return predict(key, now.model, mixture, "none")
         key_noise, *keys = jax.random.split(key, 1 + len(self.exponents))
         before, parents = mixture, mixture.particles

@@ -175,12 +175,7 @@ class Filter(eqx.Module):
         self, observation: PyTree = None, inputs: PyTree = None, is_initial: bool = False
     ) -> Step:
         """The step with this y_t and u_t."""
-        model = with_inputs(self.model, inputs)
-        return Step(
-            model, observation, inputs=inputs, initial_model=self.model, moves=self.moves,
-            initial_moves=self.initial_moves, initial_noise=self.initial_noise,
-            is_initial=is_initial,
-        )  # fmt: skip
+        return Step(with_inputs(self.model, inputs), observation, inputs, self, is_initial)
 
     def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
         return law_of(self.model).sample_initial(key, self.num_particles, self.initial_noise)

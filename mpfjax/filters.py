@@ -173,7 +173,6 @@ def gaussian_mixture_particle_filter(
     importance: Importance = "propagated",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
-    regroup: Sequence[AbstractMove] | None = None,
     regroup_every: Count = 1,
 ) -> Filter:
     """GM-MPF: redraw each component from the Gaussian of its moments, propagate, regroup.
@@ -197,14 +196,12 @@ def gaussian_mixture_particle_filter(
         model, num_particles, proposal=proposal, regeneration=regeneration, importance=importance
     )
     options = _grouping_options(model, features, scale)
-    return _mixture(plain, max_components, options, _ITERATIONS, regroup, regroup_every)
+    return _mixture(plain, max_components, options, _ITERATIONS, None, regroup_every)
 
 
 @checked
 def partitioned_sampling(
-    model: MultiObjectModel,
-    num_particles: Count,
-    order: Sequence[int] | Array | None = None,
+    model: MultiObjectModel, num_particles: Count, order: Sequence[int] | Array | None = None
 ) -> Filter:
     """Partitioned sampling: resample, then propagate one object after the other.
 
@@ -302,11 +299,7 @@ def bernoulli_filter(
     a single object use a filter with `ClutteredModel`, for boxes in a video `vision.ObjectTracker`.
     """
     resample = RegenerateObjects() if resample is None else resample
-    associate = Associate(
-        particles_per_birth=particles_per_birth,
-        undetected_particles=undetected_particles,
-        resample=resample,
-    )
+    associate = Associate(particles_per_birth, undetected_particles, resample)
     return Filter(model, [Predict(proposal), associate], num_particles, max_targets + 1)
 
 

@@ -6,21 +6,20 @@ import numpy as np
 
 import mpfjax
 from mpfjax import ParticleMixture
+from mpfjax.mixture import single_component
 
 NUM_PARTICLES = 40
 NUM_COMPONENTS = 6
+AT_START = mpfjax.Step(None, is_initial=True)  # where every move runs, whatever the model
 
 
 def make_mixture(states, log_weights, labels, num_components, memory=None) -> ParticleMixture:
     """A normalised mixture from arrays of numpy, each slot its own ancestor."""
     log_weights = np.asarray(log_weights, float)
     log_weights = log_weights - np.logaddexp.reduce(log_weights)
-    return ParticleMixture(
-        particles=jnp.asarray(states, float),
+    return single_component(jnp.asarray(states, float), num_components).replace(
         log_weights=jnp.asarray(log_weights, float),
         component_indicators=jnp.asarray(labels, jnp.int32),
-        ancestor_indices=jnp.arange(len(log_weights), dtype=jnp.int32),
-        num_components=num_components,
         memory={} if memory is None else memory,
     )
 

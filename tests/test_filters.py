@@ -180,7 +180,7 @@ def test_features_and_scale_are_given_once(make):
     regrouping = [m for m in (*filter.moves, *filter.initial_moves) if hasattr(m, "features")]
     assert [(m.features, m.scale) for m in regrouping] == [(first, (3.0,))] * 4
     own = mpfjax.KMeans(2, features=lambda states: states[:, 1])
-    filter = getattr(mpfjax, make)(Drift(), 20, 2, regroup=[own], regroup_every=1)
+    filter = mpfjax.mixture_particle_filter(Drift(), 20, 2, regroup=[own], regroup_every=1)
     assert own in filter.moves
     of_one = getattr(mpfjax, make)(
         mpfjax.per_particle(DriftOfOne()), 20, 2, features=lambda state: state[0]

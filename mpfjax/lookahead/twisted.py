@@ -20,7 +20,6 @@ from mpfjax.moves.base import (
     AbstractRegrouping,
     AbstractWrapper,
     Step,
-    is_missing,
 )
 from mpfjax.moves.propagation.propagate import noise_of_slots
 from mpfjax.operations.logarithms import log_sum_exp
@@ -98,7 +97,7 @@ class PropagateTwisted(AbstractPropagation, AbstractWrapper):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
-        if is_missing(now):
+        if now.is_missing:
             return self.move(key, mixture, now)
         law, previous = now.law, mixture.particles
         dimension = law.noise_dimension(previous) + 1

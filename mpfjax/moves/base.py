@@ -15,7 +15,6 @@ from mpfjax.checks import Checked, check, is_series, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.law import Law, law_of
-from mpfjax.models.noise import Noise
 from mpfjax.operations.random import split
 
 Gradient = Literal["none", "stop"]
@@ -28,17 +27,11 @@ class Step(eqx.Module):
     """the filter's own model, an `AbstractStateSpaceModel` at u_t."""
     observation: PyTree = None
     """y_t; None where it is missing, and most moves then do nothing."""
-    inputs: PyTree = eqx.field(default=None, kw_only=True)
+    inputs: PyTree = None
     """u_t, the known inputs of the step, from which the model at u_t was made."""
-    initial_model: PyTree = eqx.field(default=None, kw_only=True)
-    """the filter's model without inputs, whose p(x_0) is the prior; None where it is `model`."""
-    moves: "Moves" = eqx.field(default=(), kw_only=True)
-    """the filter's own chain."""
-    initial_moves: "Moves" = eqx.field(default=(), kw_only=True)
-    """those of x_0."""
-    initial_noise: Noise = eqx.field(static=True, default="independent", kw_only=True)
-    """what x_0 is made of."""
-    is_initial: bool = eqx.field(static=True, default=False, kw_only=True)
+    filter: Any = None
+    """the `Filter` itself, whose model has no inputs; None for a move that is run alone."""
+    is_initial: bool = eqx.field(static=True, default=False)
     """whether it is x_0 that is moved, with y_1 for an observation, if that is known."""
 
     @property
@@ -47,9 +40,15 @@ class Step(eqx.Module):
         return self.observation is not None
 
     @property
+    def is_missing(self) -> bool:
+        """Whether it is a step without an observation, as the moving of x_0 is not."""
+        return not self.is_present and not self.is_initial
+
+    @property
     def propagation(self) -> "AbstractPropagationOfEach | None":
-        """The filter's move that draws and weights x_t of each particle; None if it has none."""
-        return propagation_of(self.moves)
+        """The filter's first move that draws and weights x_t of each particle; None without one."""
+        chain = all_of(self.filter.moves if self.filter else (), within=False)
+        return next((move for move in chain if isinstance(move, AbstractPropagationOfEach)), None)
 
     @property
     def law(self) -> Law:
@@ -59,7 +58,7 @@ class Step(eqx.Module):
     @property
     def initial_law(self) -> Law:
         """The law of the model without inputs, because x_0 has no input."""
-        return law_of(self.model if self.initial_model is None else self.initial_model)
+        return law_of((self.filter or self).model)
 
 
 class Given(Checked):
@@ -171,11 +170,11 @@ def as_moves(moves: Any, name: str) -> Moves:
 
 
 def in_turn(
-    key: Key[Array, ""], moves: Moves, mixture: ParticleMixture, now: Step | None
+    key: Key[Array, ""], moves: Moves, mixture: ParticleMixture, now: Step
 ) -> ParticleMixture:
     """The mixture after the moves, one after the other, as at some steps of a run alone."""
     for move_key, move in zip(split(key, len(moves)), moves, strict=True) if moves else ():
-        mixture = move(move_key, mixture, now)  # pyright: ignore[reportArgumentType]
+        mixture = move(move_key, mixture, now)
     return mixture.with_order(False)
 
 
@@ -204,11 +203,6 @@ def memory_of(moves: Iterable[AbstractMove], now: Step, num_components: int) -> 
     return memory
 
 
-def is_missing(now: Step | None) -> bool:
-    """Whether a move is part of a step without an observation, as x_0 is not."""
-    return now is not None and not now.is_present and not now.is_initial
-
-
 Regrouped = tuple[Int[Array, " n"], dict[str, PyTree]]
 
 
@@ -228,11 +222,9 @@ class AbstractRegrouping(AbstractMove):
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The new component indicators, and the new memory of the mixture."""
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Regroup the particles, unless y_t is missing."""
-        if mixture.num_components == 1 or is_missing(now):
+        if mixture.num_components == 1 or now.is_missing:
             return mixture
         # Indicators are whole numbers and have no derivative.
         return self.with_indicators(mixture, *self.regroup(key, jax.lax.stop_gradient(mixture)))
@@ -265,11 +257,9 @@ class AbstractResampling(AbstractMove):
     def resample(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """The mixture with its particles redrawn."""
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Resample, unless y_t is missing, or the mixture waits for it."""
-        if is_missing(now):
+        if now.is_missing:
             return mixture
         return unless_waiting(self.resample(key, mixture), mixture)
 
@@ -378,12 +368,6 @@ class AbstractProposal(Given):
         returns the same as `propose`, and `noise_dimension(previous_states)`, which is k;
         `Propagate(noise="rqmc")` requires both.
         """
-
-
-def propagation_of(moves: Moves) -> AbstractPropagationOfEach | None:
-    """The first move that propagates particles each on its own, also within a wrapper."""
-    chain = all_of(moves, within=False)
-    return next((move for move in chain if isinstance(move, AbstractPropagationOfEach)), None)
 
 
 def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: str) -> None:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Int, Key, PyTree
 from mpfjax.memory import Memory, Offspring
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
-from mpfjax.moves.base import AbstractPropagation, Step, is_missing
+from mpfjax.moves.base import AbstractPropagation, Step
 from mpfjax.operations.stored import select_rows, take
 
 REFERENCE = "reference"  # the name of its slot in a mixture's memory
@@ -76,10 +76,10 @@ class ConditionalPropagation(AbstractPropagation):
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate around x*_t, and weigh as the move does."""
         proposal, previous = self.move.proposal, mixture.particles
-        if proposal is None or is_missing(now):
+        if proposal is None or now.is_missing:
             unseen = dataclasses.replace(now, observation=None)
             moved = self._with_reference(self.move(key, mixture, unseen))
-            return moved if is_missing(now) else self.move.reweight(moved, now)
+            return moved if now.is_missing else self.move.reweight(moved, now)
         states, log_density = proposal.propose(key, now, previous)
         moved = self._with_reference(mixture.replace(particles=states))
         slot = mixture.memory[REFERENCE].slot

@@ -7,7 +7,7 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractWrapper, Moves, Step, as_moves, in_turn, is_missing, name_of
+from mpfjax.moves.base import AbstractWrapper, Moves, Step, as_moves, in_turn, name_of
 
 
 class Every(AbstractWrapper):
@@ -47,11 +47,9 @@ class Every(AbstractWrapper):
         counter = {self.name: {"steps": jnp.zeros((), jnp.int32)}}
         return counter | super().initial_memory(now, num_components)
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Run the moves if this is a k-th step; none where y_t is missing."""
-        if is_missing(now):
+        if now.is_missing:
             return mixture
         steps = mixture.memory[self.name]["steps"] + 1
         memory = mixture.memory | {self.name: {"steps": steps % self.every}}

@@ -62,7 +62,7 @@ class SelectInitial(AbstractMove):
             return mixture
         assert now.propagation is not None
         key_drawn, key_look, key_kept = split(key, 3)
-        n, noise = mixture.num_particles, now.initial_noise
+        n, noise = mixture.num_particles, now.filter.initial_noise
         states = now.initial_law.sample_initial(key_drawn, self.num_draws * n, noise)
         # Stored, so that x_1 is drawn on vectors, and once, not wherever its likelihood is used.
         twice = single_component(states).repeat(2).map_slots(stored)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.models.law import law_of, refuse_marginalised
-from mpfjax.moves.base import AbstractMarkovMove, Gradient, Step, is_missing
+from mpfjax.moves.base import AbstractMarkovMove, Gradient, Step
 from mpfjax.operations.logarithms import add_gradient, without_gradient
 from mpfjax.operations.random import split, uniform
 from mpfjax.operations.stored import select_rows
@@ -82,7 +82,7 @@ class AbstractMetropolis(AbstractMarkovMove):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Move every particle, unless y_t is missing."""
-        if is_missing(now):
+        if now.is_missing:
             return mixture
         if mixture.parents is None:
             who = f"moves: {type(self).__name__}"

@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Key, PyTree
 
 from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
-from mpfjax.mixture import ParticleMixture
+from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.series import as_series, series_of
-from mpfjax.moves.base import AbstractMove, Step, is_missing
+from mpfjax.moves.base import AbstractMove, Step
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.islands import (
     DEVICE_AXIS,
@@ -119,12 +119,11 @@ def _whole_mixture(islands: ParticleMixture) -> ParticleMixture:
     def side_by_side(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[2:])
 
-    return ParticleMixture(
-        particles=jax.tree.map(side_by_side, islands.particles),
+    particles = jax.tree.map(side_by_side, islands.particles)
+    return single_component(particles, num_islands * num_components).replace(
         log_weights=side_by_side(islands.log_weights),
         component_indicators=side_by_side(islands.component_indicators + firsts[:, None]),
         ancestor_indices=side_by_side(islands.ancestor_indices),
-        num_components=num_islands * num_components,
         memory=islands.memory,
         t=islands.t[0],
         periods=jax.tree.map(lambda leaf: leaf[0], islands.periods),
@@ -172,12 +171,10 @@ class IslandInteraction(AbstractMove):
         log_masses = over_islands(mixture.log_mass)
         return 1 / jnp.sum(softmax(log_masses) ** 2) < self.threshold * num_islands()
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Deal the particles if it is due, unless y_t is missing."""
         n, islands = mixture.num_particles, num_islands()
-        if islands == 1 or is_missing(now):
+        if islands == 1 or now.is_missing:
             return mixture
         if n % islands:
             raise ValueError(f"num_particles: {n} of an island, for {islands} islands alike")

@@ -158,8 +158,9 @@ class _KeepEveIndices(AbstractMove):
 
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for a chain of which the errors of one run are not known."""
-        check_keep_parents("filter", now.moves, "with_eve_indices")
-        moves = [move for move in now.initial_moves if move is not self] + list(now.moves)
+        filter = now.filter
+        check_keep_parents("filter", filter.moves, "with_eve_indices")
+        moves = [move for move in (*filter.initial_moves, *filter.moves) if move is not self]
         for move in all_of(moves):
             if move.approximate or not move.keeps_families:
                 name = type(move).__name__
@@ -169,11 +170,11 @@ class _KeepEveIndices(AbstractMove):
         def draws(node: Any) -> bool:
             return hasattr(node, "scheme") or hasattr(node, "noise")
 
-        for part in [now, *jax.tree.leaves(moves, is_leaf=draws)]:
+        for part in [filter, *jax.tree.leaves(moves, is_leaf=draws)]:
             for option, independent in _INDEPENDENT.items():
                 chosen = getattr(part, option, independent)
                 if chosen != independent:
-                    name = "the filter" if part is now else type(part).__name__
+                    name = "the filter" if part is filter else type(part).__name__
                     which = f"{chosen!r}, not {independent!r}"
                     raise ValueError(f"filter: {option} of {name} is {which}")
 
@@ -181,9 +182,7 @@ class _KeepEveIndices(AbstractMove):
         """Raise a `ValueError`: in conditional SMC one particle is not drawn."""
         raise ValueError("filter: with_eve_indices cannot keep a trajectory, which is not drawn")
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """The mixture with a memory in which every particle is its own Eve."""
         return mixture.replace(memory=mixture.memory | {EVE_INDICES: EveIndices.of(mixture)})
 

@@ -81,9 +81,9 @@ def check_model(
     for fault in _faults(key, model, observation, inputs):
         raise ValueError(f"model: {base.model_name(model)}.{fault}")
     if proposal is not None:
-        now = Step(base.with_inputs(model, inputs), observation, inputs=inputs, initial_model=model)
+        now = Step(base.with_inputs(model, inputs), observation, inputs)
         proposal.check(now)
-        for fault in _of_density("propose", "its draws", *_of_proposal(key, now, proposal)):
+        for fault in _of_density("propose", "its draws", *_of_proposal(key, model, now, proposal)):
             raise ValueError(f"proposal: {type(proposal).__name__}.{fault}")
 
 
@@ -293,9 +293,9 @@ def _of_origins(
 
 
 @_jit
-def _of_proposal(key, now, proposal):
+def _of_proposal(key, model, now, proposal):
     """Draws of a proposal from each of a few x_0, and log q."""
-    starts = _initial(jax.random.fold_in(key, 1), now.initial_model, _PLACES)
+    starts = _initial(jax.random.fold_in(key, 1), model, _PLACES)
     draws, logs = proposal.propose(key, now, _repeat(starts, _DENSITY_DRAWS))
     return now.law.part(draws), logs
 

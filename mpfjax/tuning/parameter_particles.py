@@ -113,7 +113,7 @@ def rejuvenate(key, sampler, samples, num_steps):
     num_chains = samples.num_particles // (num_moves + 1)
     # Multinomial, whose families say how large the error of the evidence is.
     resample = Resample(scheme="multinomial", particles_per_component=num_chains)
-    resampled = resample(key_resample, samples)
+    resampled = resample.resample(key_resample, samples)
     starts = jax.tree.map(lambda leaf: leaf[:num_chains], resampled.particles)
 
     evaluate = partial(sampler.run_again, num_steps=num_steps)

@@ -10,7 +10,7 @@ import mpfjax
 from mpfjax import AuxiliaryResample, GaussNewtonProposal, Resample
 from mpfjax.exact import kalman_filter
 from mpfjax.operations.segments import segment_sum
-from tests.examples import make_mixture
+from tests.examples import AT_START, make_mixture
 from tests.unbiased import assert_unbiased, ratios_to
 
 KEY = jax.random.key(0)
@@ -92,7 +92,7 @@ def test_ancestors_are_those_of_the_particles_and_the_promising_have_more():
 @pytest.mark.exactness
 def test_a_look_ahead_of_zero_throughout_a_component_is_left_out():
     nothing = moved_by(lambda y, states: jnp.full(30, -jnp.inf), jnp.float32(1.5))
-    plain = eqx.filter_jit(Resample())(KEY, MIXTURE)
+    plain = eqx.filter_jit(Resample())(KEY, MIXTURE, AT_START)
     np.testing.assert_array_equal(nothing.particles, plain.particles)
     np.testing.assert_allclose(nothing.log_weights, plain.log_weights, atol=1e-5)
 

@@ -134,6 +134,10 @@ def model(rate=0.5, **options):
     return TargetsModel(SENSOR, Birth(jnp.float32(rate)), **options)
 
 
+def associating(particles_per_birth=50, undetected_particles=400):
+    return Associate(particles_per_birth, undetected_particles, mpfjax.Resample())
+
+
 def bernoulli_mixture(filter, states, existence):
     """Objects of these particles, (m, n, 1), and no others, after as many empty slots."""
     m, n = states.shape[:2]
@@ -168,7 +172,7 @@ def test_one_scan_is_that_of_all_associations(apart):
     rng, targets = np.random.default_rng(0), model()
     states = rng.normal(0, 0.5, (3, n, 1)) + apart * np.arange(3)[:, None, None]
     filter = Filter(
-        targets, [Associate(particles_per_birth=400, undetected_particles=100)], 3 * n + 100, 8
+        targets, [associating(particles_per_birth=400, undetected_particles=100)], 3 * n + 100, 8
     )
     mixture = bernoulli_mixture(filter, states, existence)
     padded = jnp.asarray(np.append(scan, NAN)[:, None], jnp.float32)
@@ -201,7 +205,7 @@ def test_a_known_single_object_is_that_of_all_associations():
     sets, n = jnp.asarray(SETS, jnp.float32), 300
 
     def run(key, targets, sets):
-        moves = [Predict(), Associate(undetected_particles=1)]
+        moves = [Predict(), associating(undetected_particles=1)]
         filter = Filter(targets, moves, n + 1, 3)
         keys = jax.random.split(key, 1 + len(sets))
         mixture = bernoulli_mixture(filter, np.zeros((1, n, 1)), [1.0])
@@ -277,8 +281,7 @@ def gaussian_sums(number, rate, survival, first, second):
 def test_two_scans_are_those_of_gaussian_sums(number, first, second, proposal):
     """From a Poisson number of objects; and of two that began in one scan, which are not one."""
     old, new, undetected, log_evidence = gaussian_sums(number, 0.5, 0.95, first, second)
-    options = {"particles_per_birth": 500, "undetected_particles": 1000}
-    move = Associate(resample=mpfjax.Resample(), **options)
+    move = associating(500, 1000)
     filter = Filter(model(initial_number=number), [Predict(proposal), move], 3000, 7)
     scans = jnp.asarray([first, [*second, *[NAN] * (2 - len(second))]], jnp.float32)[..., None]
     runs = mpfjax.monte_carlo(
@@ -301,7 +304,7 @@ def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
     """One object that may exist, against the product of the sensors' likelihoods."""
     near = ClutteredModel(OBJECT, lambda states: jnp.where(states[:, 0] < 1, 0.9, 0.0), CLUTTER)
     targets = TargetsModel((SENSOR, near), Birth(jnp.float32(1e-12)), 0.95)
-    filter = Filter(targets, [Associate(particles_per_birth=2, undetected_particles=10)], 110, 3)
+    filter = Filter(targets, [associating(particles_per_birth=2, undetected_particles=10)], 110, 3)
     states = np.random.default_rng(0).normal(0.5, 1, (1, 100, 1))
     mixture, r = bernoulli_mixture(filter, states, [0.9]), 0.95 * 0.9
     for scan in ([[0.2], [NAN]], [[NAN], [NAN]]):
@@ -324,7 +327,7 @@ def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
 @pytest.mark.exactness
 def test_two_components_of_one_object_become_one():
     """Where both may be true by their probabilities they stay, and where they are apart."""
-    filter = Filter(model(1e-12), [Associate(undetected_particles=10)], 210, 3)
+    filter = Filter(model(1e-12), [associating(undetected_particles=10)], 210, 3)
     near = np.linspace(-1, 1, 100) + np.array([0.0, 0.8])[:, None]
     for gap, existence, expected in (
         (0.0, [0.5, 0.4], [0.9, 0]), (0.0, [0.7, 0.6], [0.7, 0.6]), (9.0, [0.5, 0.4], [0.5, 0.4])
@@ -386,9 +389,9 @@ def test_objects_without_room_are_told_and_the_table_has_the_rest():
     with pytest.raises(ValueError, match="not for islands"):
         mpfjax.run_islands(KEY, mpfjax.bernoulli_filter(crowd, 900, 2), scans, num_islands=2)
     with pytest.raises(ValueError, match="model: "):
-        Filter(OBJECT, [Predict(), Associate()], 1000, 3)
+        Filter(OBJECT, [Predict(), associating()], 1000, 3)
     with pytest.raises(ValueError, match="num_particles: 100 is less than 402"):
-        Filter(crowd, [Predict(), Associate()], 100, 3)
+        Filter(crowd, [Predict(), associating()], 100, 3)
 
 
 def test_the_number_is_that_of_independent_events():
@@ -586,7 +589,7 @@ def test_inputs_reach_survival_births_detection_and_clutter():
 def test_regenerated_objects_have_the_covariance_of_their_weights_and_more_slots_where_they_exist():
     """Over samples of ten, the variance is the population's; the paper's estimate is less."""
     n, rng = 10, np.random.default_rng(0)
-    filter = Filter(model(), [Predict(), Associate(undetected_particles=1)], 101, 3)
+    filter = Filter(model(), [Predict(), associating(undetected_particles=1)], 101, 3)
     states = rng.normal(0, 2, (400, 2, n, 1))
     mixture = bernoulli_mixture(filter, states[0], [0.999, 0.001])
 

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax import ParticleMixture, Resample
+from mpfjax import Resample
 from mpfjax.moves.conditional import REFERENCE, ReferenceSlot
+from tests.examples import AT_START, make_mixture
 from tests.marking import quick_of
 from tests.unbiased import assert_unbiased
 
@@ -40,16 +41,10 @@ def drawn(case):
         key_reference, key_plain, key_around = jax.random.split(key, 3)
         weights = jnp.asarray(WEIGHTS, jnp.float32)
         slot = jax.random.categorical(key_reference, jnp.log(weights)).astype(jnp.int32)
-        mixture = ParticleMixture(
-            particles=jnp.arange(8.0),
-            log_weights=jnp.log(weights),
-            component_indicators=jnp.asarray(LABELS[m], jnp.int32),
-            ancestor_indices=jnp.arange(8, dtype=jnp.int32),
-            num_components=m,
-        )
+        mixture = make_mixture(np.arange(8.0), np.log(WEIGHTS), LABELS[m], m)
         memory = {REFERENCE: ReferenceSlot(slot)}
-        around = move(key_around, mixture.replace(memory=memory))
-        return slot, move(key_plain, mixture), around
+        around = move(key_around, mixture.replace(memory=memory), AT_START)
+        return slot, move(key_plain, mixture, AT_START), around
 
     return jax.tree.map(np.asarray, one(jax.random.split(jax.random.key(5), NUM_RUNS)))
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mpfjax import QuadraticModel, Resample, Step
-from tests.examples import example_mixtures, log_masses
+from tests.examples import AT_START, example_mixtures, log_masses
 from tests.marking import quick_of
 from tests.registry import REGROUPINGS, WITHIN_COMPONENTS
 
@@ -35,7 +35,7 @@ RESAMPLINGS = [(name, m) for name, m in CASES if isinstance(WITHIN_COMPONENTS[na
 
 @eqx.filter_jit
 def moved_by(move, key, mixture):
-    return move(key, mixture)
+    return move(key, mixture, AT_START)
 
 
 @jax.jit
@@ -78,7 +78,7 @@ def test_regrouping_treats_every_copy_of_a_particle_alike(name):
 @eqx.filter_jit
 def draws_of(move, mixture):
     keys = jax.random.split(jax.random.key(1), NUM_DRAWS)
-    return jax.vmap(lambda key: move(key, mixture))(keys)
+    return jax.vmap(lambda key: move(key, mixture, AT_START))(keys)
 
 
 @pytest.mark.exactness

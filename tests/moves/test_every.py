@@ -8,6 +8,7 @@ import pytest
 import mpfjax
 from mpfjax import Every, KMeans, Merge, Propagate, Split
 from mpfjax.mixture import single_component
+from tests.examples import AT_START, make_mixture
 from tests.registry import RandomLabels
 
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
@@ -54,13 +55,11 @@ def test_a_label_that_dies_within_and_is_used_again_has_no_past():
     """Merge frees a label and Split takes it: what is remembered of the pair begins anew."""
     states = jnp.concatenate([jnp.full(10, 0.0), jnp.full(10, 0.01), jnp.full(10, 9.0)])
     states = (states + 1e-3 * jnp.arange(30.0)).at[20:25].add(-4.0)
-    mixture = mpfjax.ParticleMixture(
-        states, jnp.full(30, -jnp.log(30.0)), jnp.repeat(jnp.arange(3), 10), jnp.arange(30), 3
-    )
+    mixture = make_mixture(states, np.zeros(30), np.repeat(np.arange(3), 10), 3)
     every = Every(1, [Merge(None, max_distance=1.0, patience=2), Split(1.0)])
     durations = jnp.array([[5, 5, 0], [5, 5, 0], [0, 0, 5]], jnp.int32)
     memory = every.initial_memory(mpfjax.Step(MODEL), 3) | {"overlap_durations": durations}
-    after = every(KEYS[0], mixture.replace(memory=memory))
+    after = every(KEYS[0], mixture.replace(memory=memory), AT_START)
     np.testing.assert_array_equal(np.unique(after.component_indicators), [0, 1, 2])
     assert after.memory["overlap_durations"][0, 1] == 0
 
@@ -87,11 +86,7 @@ def test_a_move_that_holds_moves_forwards_all_that_they_are():
         assert getattr(move, name), name
     for name in ("keeps_parents", "keeps_families", "weighs"):
         assert not getattr(move, name), name
-    mixture = mpfjax.ParticleMixture(
-        jnp.arange(4.0), jnp.full(4, -jnp.log(4.0)), jnp.arange(4) % 2, jnp.arange(4), 3,
-        memory=move.initial_memory(mpfjax.Step(MODEL), 3),
-    )  # fmt: skip
-    assert "odd" in mixture.memory
+    assert "odd" in move.initial_memory(mpfjax.Step(MODEL), 3)
     now = mpfjax.Step(MODEL, jnp.float32(1.0))
     with pytest.raises(ValueError, match="odd"):
         move.check(now, 4, 3)
@@ -113,5 +108,5 @@ def test_particles_in_order_come_through():
     mixture = single_component(jnp.arange(6.0), 2).at_step().with_order(True)
     filter = mpfjax.Filter(MODEL, [Propagate(), Every(2, [RandomLabels()])], 6, 2)
     memory = filter.moves[1].initial_memory(mpfjax.Step(MODEL), 2)
-    moved = filter.moves[1](KEYS[0], mixture.replace(memory=memory), None)
+    moved = filter.moves[1](KEYS[0], mixture.replace(memory=memory), AT_START)
     np.testing.assert_array_equal(moved.particles, mixture.particles)

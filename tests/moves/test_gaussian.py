@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mpfjax import GaussianRegeneration
-from tests.examples import make_mixture
+from tests.examples import AT_START, make_mixture
 from tests.unbiased import assert_unbiased
 
 NUM_DRAWS = 2000
@@ -24,7 +24,7 @@ MIXTURE = make_mixture(
 @eqx.filter_jit
 def draw_many(move, mixture, num_draws=NUM_DRAWS):
     keys = jax.random.split(jax.random.key(1), num_draws)
-    return jax.vmap(lambda key: move(key, mixture))(keys)
+    return jax.vmap(lambda key: move(key, mixture, AT_START))(keys)
 
 
 @pytest.mark.exactness
@@ -57,4 +57,4 @@ def test_a_singular_covariance_draws_within_its_plane_and_where_leaves_the_rest_
     np.testing.assert_allclose(box[..., 1], 2 * box[..., 0], atol=1e-4)
     np.testing.assert_array_equal(after.particles["kind"], 10 * after.component_indicators)
     with pytest.raises(ValueError, match=r"where: the state\['kind'\] is int32"):
-        GaussianRegeneration()(jax.random.key(0), mixture)
+        GaussianRegeneration()(jax.random.key(0), mixture, AT_START)

@@ -11,7 +11,7 @@ import scipy.stats
 
 import mpfjax
 from mpfjax import Propagate, PropagateNested, Resample
-from tests.examples import make_mixture
+from tests.examples import AT_START, make_mixture
 from tests.marking import quick_of
 from tests.user_models import DRIFT_AS_LINEAR_GAUSSIAN, Drift
 
@@ -107,7 +107,7 @@ def test_without_an_observation_the_noise_is_a_point_set_as_well():
 
 @eqx.filter_jit
 def resampled(mixture, along_curve=True):
-    return Resample(along_curve=along_curve)(KEY, mixture)
+    return Resample(along_curve=along_curve)(KEY, mixture, AT_START)
 
 
 @pytest.mark.exactness

@@ -21,7 +21,7 @@ from mpfjax import (
     Resample,
     Split,
 )
-from tests.examples import make_mixture
+from tests.examples import AT_START, make_mixture
 
 KEY = jax.random.key(0)
 RNG = np.random.default_rng(0)
@@ -38,7 +38,7 @@ def clouds(centres, sizes, scale=1.0, num_components=6, weights=None, labels=Non
 
 
 def labels_after(move, mixture):
-    return np.asarray(eqx.filter_jit(move)(KEY, mixture).component_indicators)
+    return np.asarray(eqx.filter_jit(move)(KEY, mixture, AT_START).component_indicators)
 
 
 class TestKMeans:
@@ -273,7 +273,7 @@ def test_only_what_is_below_the_share_of_the_heaviest_is_pruned(masses):
     log_weights = np.repeat(np.log(np.array(masses) / 3), 3)
     before = make_mixture(np.zeros(len(masses) * 3), log_weights,
                           np.repeat(np.arange(len(masses)), 3), len(masses))  # fmt: skip
-    after, lives = Prune(1e-3)(KEY, before), np.array(masses) >= 1e-3 * max(masses)
+    after, lives = Prune(1e-3)(KEY, before, AT_START), np.array(masses) >= 1e-3 * max(masses)
     np.testing.assert_array_equal(after.active, lives)
     kept = lives[np.asarray(before.component_indicators)]
     np.testing.assert_array_equal(after.log_weights[kept], before.log_weights[kept])

@@ -12,7 +12,7 @@ from mpfjax import Resample
 from mpfjax.moves.resampling.allocation import EQUAL_PARTS, FEWEST
 from mpfjax.moves.resampling.ancestors import SCHEMES
 from mpfjax.operations import prefix_sums
-from tests.examples import make_mixture
+from tests.examples import AT_START, make_mixture
 from tests.marking import quick_of
 from tests.unbiased import assert_unbiased
 
@@ -22,7 +22,7 @@ KEY = jax.random.key(0)
 
 @eqx.filter_jit
 def draw(move, mixture, key=KEY):
-    return move(key, mixture)
+    return move(key, mixture, AT_START)
 
 
 def large_mixture(kind, n, m, in_order):
@@ -65,7 +65,7 @@ def redraw_with(move):
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(jax.random, "uniform", patched)
-            return move(key, mixture)
+            return move(key, mixture, AT_START)
 
     return redraw
 
@@ -142,7 +142,8 @@ def test_means_of_many_particles_stay_where_they_are(scheme, kind, m):
 def test_components_draw_their_offsets_independently():
     log_weights = np.tile(np.log([0.05, 0.95] * 5), 2)
     mixture = make_mixture(np.arange(20.0), log_weights, np.repeat([0, 1], 10), 2)
-    moved = jax.jit(jax.vmap(lambda key: Resample()(key, mixture)))(jax.random.split(KEY, 2000))
+    keys = jax.random.split(KEY, 2000)
+    moved = jax.jit(jax.vmap(lambda key: Resample().resample(key, mixture)))(keys)
     first, second = (np.asarray(moved.ancestor_indices == i).any(axis=1) for i in (0, 10))
     assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(2000)
 

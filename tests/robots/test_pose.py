@@ -7,17 +7,14 @@ import pytest
 
 import mpfjax
 from mpfjax import robots
+from tests.examples import make_mixture
 from tests.robots.test_robots import ANGLES, GRID, MOST
 
 
 def test_localised_is_the_mass_near_the_heaviest_component():
     """.5 in one component, of which .1 is far away, .3 near it in another, .2 elsewhere."""
     states = jnp.array([[0.0, 0, 0], [0.2, 0, 0], [0.1, 0.9, 1], [5.0, 0, 0]])
-    mixture = mpfjax.ParticleMixture(
-        particles=states, log_weights=jnp.log(jnp.array([0.25, 0.25, 0.3, 0.2])),
-        component_indicators=jnp.array([0, 0, 1, 2], jnp.int32),
-        ancestor_indices=jnp.full(4, -1, jnp.int32), log_scale=jnp.zeros(()), num_components=3,
-    )  # fmt: skip
+    mixture = make_mixture(states, np.log([0.25, 0.25, 0.3, 0.2]), [0, 0, 1, 2], 3)
     assert robots.localised(mixture) == pytest.approx(0.8)
     assert robots.localised(mixture, 0.5) == pytest.approx(0.5)
 

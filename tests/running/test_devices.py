@@ -22,7 +22,7 @@ from mpfjax.operations.segments import segment_sum
 from mpfjax.running.devices import over_threads
 from mpfjax.running.islands import IslandInteraction
 from tests import on_devices
-from tests.examples import make_mixture
+from tests.examples import AT_START, make_mixture
 from tests.precision import float64
 from tests.unbiased import assert_unbiased
 
@@ -131,7 +131,7 @@ class TestExchange:
 
         islands = jax.tree.map(on_each, whole)
         move = jax.vmap(
-            lambda part: IslandInteraction(threshold)(jax.random.key(0), part),
+            lambda part: IslandInteraction(threshold)(jax.random.key(0), part, AT_START),
             axis_name=ISLAND_AXIS,
         )
         return islands, jax.vmap(move, axis_name=DEVICE_AXIS)(islands)

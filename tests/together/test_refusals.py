@@ -123,7 +123,8 @@ GOOD = {
     mpfjax.UniformBirth: BIRTH,
     mpfjax.Box: {"low": [0.0], "high": [1.0]},
     mpfjax.Disc: {"centre": [0.0], "radius": 1.0},
-    mpfjax.Associate: {"particles_per_birth": 2},
+    mpfjax.Associate: {
+        "particles_per_birth": 2, "undetected_particles": 4, "resample": Resample()},
     mpfjax.bernoulli_filter: {
         "model": mpfjax.TargetsModel(**TARGETS), "num_particles": 500, "max_targets": 2},
     mpfjax.per_particle: {"model": DriftOfOne()},
@@ -353,7 +354,8 @@ REFUSED = (
      lambda: mpfjax.Every(2, [KMeans(), Propagate()])),
     ("moves: two of them use the memory 'every 2: KMeans', as Every", lambda: FILTER.replace(
         moves=[*FILTER.moves, *(mpfjax.Every(2, [KMeans(k)]) for k in (1, 2))])),
-    ("group: it returned", lambda: mpfjax.GroupBy(lambda x: jnp.zeros(2, int))(KEY, MIXTURE)),
+    ("group: it returned",
+     lambda: mpfjax.GroupBy(lambda x: jnp.zeros(2, int)).regroup(KEY, MIXTURE)),
     ("importance: .* draws from no proposal", lambda: mpfjax.gaussian_particle_filter(
         MODEL, 5, importance="predictive_gaussian", proposal=GUIDE)),
     ("num_slots: 3 is not at least N, 4",

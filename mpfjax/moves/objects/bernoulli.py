@@ -8,12 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 from mpfjax.checks import Count, check
-from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
+from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors, single_component
 from mpfjax.models.clutter import fill_missing, measurement_mask
 from mpfjax.models.targets import TargetsModel
 from mpfjax.moves.base import AbstractResampling, AbstractWrapper, Step
 from mpfjax.moves.objects.association import associate
-from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.islands import num_islands
 from mpfjax.operations.logarithms import add_gradient, exp, log_or_nothing
 from mpfjax.operations.random import split, uniform
@@ -103,9 +102,9 @@ class Associate(AbstractWrapper):
     Raises `ValueError` on islands, for `num_slots`, and if there are no slots for the objects.
     """
 
-    particles_per_birth: Count = eqx.field(static=True, default=50, kw_only=True)
-    undetected_particles: Count = eqx.field(static=True, default=400, kw_only=True)
-    resample: AbstractResampling = eqx.field(default=Resample(), kw_only=True)
+    particles_per_birth: Count = eqx.field(static=True)
+    undetected_particles: Count = eqx.field(static=True)
+    resample: AbstractResampling
 
     holds = ("resample",)
     approximate = True
@@ -296,12 +295,9 @@ class Associate(AbstractWrapper):
         shares /= jax.lax.stop_gradient(jnp.where(chances > 0, chances, 1.0))[drawn]
         masses = shares * undetected[drawn]
         memory["references"] = _normalised(shares * references[drawn])
-        objects = ParticleMixture(
-            particles=intensity.states,
+        objects = single_component(intensity.states, most + 1).replace(
             log_weights=log_or_nothing(jnp.where(of_each > 0, intensity.masses, 0.0)),
             component_indicators=of_each,
-            ancestor_indices=jnp.zeros_like(of_each),
-            num_components=most + 1,
             usable_slots=jnp.asarray(rest, jnp.int32),
         )
         objects = self.resample.resample(key_rest, objects)

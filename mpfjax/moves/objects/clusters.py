@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.mixture import ParticleMixture, no_ancestors
 from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel
-from mpfjax.moves.base import Step, is_missing
+from mpfjax.moves.base import Step
 from mpfjax.moves.objects.independent import (
     AbstractPropagationByObject,
     draw_rows,
@@ -118,7 +118,7 @@ class PropagateInClusters(AbstractPropagationByObject):
         Where y_t is missing, all objects are predicted, and clusters stay.
         """
         model = now.model
-        if is_missing(now):
+        if now.is_missing:
             return predict(key, model, mixture, "none")
         require_equal_rows(mixture, "PropagateInClusters")
         num_objects = model.num_objects

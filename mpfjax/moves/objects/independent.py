@@ -9,7 +9,7 @@ from mpfjax.checks import check
 from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
 from mpfjax.models.base import model_name
 from mpfjax.models.multi_object import MultiObjectModel
-from mpfjax.moves.base import AbstractPropagation, Step, is_missing
+from mpfjax.moves.base import AbstractPropagation, Step
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.allocation import require_equal_rows
 from mpfjax.moves.resampling.resample import Resample
@@ -60,7 +60,7 @@ class PropagateIndependently(AbstractPropagationByObject):
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """One step of every object's filter; where y_t is missing, a prediction."""
         model = now.model
-        if is_missing(now):
+        if now.is_missing:
             return predict(key, model, mixture, "none")
         require_equal_rows(mixture, "PropagateIndependently")
         num_objects = model.num_objects

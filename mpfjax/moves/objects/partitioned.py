@@ -14,7 +14,7 @@ from mpfjax.checks import check, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.multi_object import MultiObjectModel
-from mpfjax.moves.base import AbstractPropagation, AbstractWrapper, Step, is_missing
+from mpfjax.moves.base import AbstractPropagation, AbstractWrapper, Step
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.logarithms import add_gradient, log_sum_exp
@@ -89,7 +89,7 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
         """Propagate and weigh the objects of every particle in its component's order."""
         model = now.model
         gradient = "stop" if self._stops_draws else "none"
-        if is_missing(now):
+        if now.is_missing:
             return predict(key, model, mixture, gradient)
         num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.

@@ -12,12 +12,7 @@ from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
 from mpfjax.models.law import Law
-from mpfjax.moves.base import (
-    AbstractPropagation,
-    AbstractPropagationOfEach,
-    Step,
-    is_missing,
-)
+from mpfjax.moves.base import AbstractPropagation, AbstractPropagationOfEach, Step
 from mpfjax.moves.propagation.propagate import Draw
 from mpfjax.moves.propagation.proposals import ProposalOfNoise
 from mpfjax.moves.regrouping.partitions import GroupBy
@@ -138,7 +133,7 @@ class PropagateRegimes(AbstractPropagation):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate, and weigh by y_t where it is there."""
-        if is_missing(now):
+        if now.is_missing:
             pairs = now.model.all_transitions(mixture.particles.latent)
             family = self._family(mixture, [latent for latent, _ in pairs])
             log_priors = jnp.concatenate([log for _, log in pairs])
@@ -165,7 +160,8 @@ class PropagateRegimes(AbstractPropagation):
     ) -> ParticleMixture:
         """N of the N K children, their moments predicted."""
         if self.regroup is not None:
-            family = self.regroup(key, family)
+            regrouped = self.regroup.regroup(key, family)
+            family = self.regroup.with_indicators(family, *regrouped)
         line = in_line(jax.lax.stop_gradient(family), None, along_curve=False)
         targets = Resample().deal(mixture, line, family.active)
         # More slots than children are of no use: a copy would have the moments that it copies.

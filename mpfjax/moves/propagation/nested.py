@@ -9,7 +9,7 @@ from jaxtyping import Array, Key
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractPropagationOfEach, AbstractWrapper, Step, is_missing
+from mpfjax.moves.base import AbstractPropagationOfEach, AbstractWrapper, Step
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.operations.random import split, uniform
 from mpfjax.operations.stored import take
@@ -47,7 +47,7 @@ class PropagateNested(AbstractPropagationOfEach, AbstractWrapper):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
-        if is_missing(now):
+        if now.is_missing:
             # Without an observation all draws of a particle have the same weight.
             return self.propagate(key, mixture, now)
         n, k = mixture.num_particles, self.num_draws

@@ -17,7 +17,6 @@ from mpfjax.moves.base import (
     AbstractProposal,
     Gradient,
     Step,
-    is_missing,
 )
 from mpfjax.operations.logarithms import add_gradient, without_gradient
 
@@ -48,9 +47,9 @@ class Draw(AbstractPropagation):
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t; without it, by the model's own law."""
         proposal, previous, law = self.proposal, mixture.particles, now.law
-        if proposal is None or is_missing(now):
+        if proposal is None or now.is_missing:
             mixture = predict(key, now.model, mixture, self.gradient, self.noise)
-            return mixture if is_missing(now) else self.reweight(mixture, now)
+            return mixture if now.is_missing else self.reweight(mixture, now)
         draws, log_density = _propose(proposal, key, self.noise, mixture, now)
         check_moved(draws, law.part(previous), proposal, "propose")
         if self.gradient == "stop":
@@ -137,7 +136,7 @@ class Reweight(AbstractPropagation):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Reweight every particle by y_t, unless it is missing."""
-        if is_missing(now):
+        if now.is_missing:
             return mixture
         states, log_factors = now.law.see(now.observation, mixture.particles)
         return mixture.replace(particles=states).reweight(*log_factors)

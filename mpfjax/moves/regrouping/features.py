@@ -87,11 +87,6 @@ def origin(values: Float[Array, "n k"], mixture: ParticleMixture) -> Float[Array
     return total / jnp.maximum(jnp.sum(filled), 1).astype(values.dtype)
 
 
-def component_groups(mixture: ParticleMixture, groups: Int[Array, " n"]) -> Int[Array, " m"]:
-    """The group of each component, where the particles of each are of one."""
-    return jnp.round(mixture.component_expectations(groups)).astype(jnp.int32)
-
-
 class Groups(eqx.Module):
     """The mass, mean and covariance of each group of particles, zero for an empty one."""
 

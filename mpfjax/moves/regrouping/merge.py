@@ -9,21 +9,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count, InnerShare, Positive
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import (
-    AbstractMove,
-    AbstractPropagation,
-    AbstractRegrouping,
-    Regrouped,
-    Step,
-    is_missing,
-)
-from mpfjax.moves.regrouping.features import (
-    ByFeatures,
-    component_groups,
-    relative_weights,
-    separation,
-    summarise,
-)
+from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping, Regrouped, Step
+from mpfjax.moves.regrouping.features import ByFeatures, relative_weights, separation, summarise
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
 
@@ -134,16 +121,14 @@ class Prune(AbstractMove):
     weighs = False
     """the observation changes no weight."""
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Set the weights of improbable components to zero, unless y_t is missing."""
-        if is_missing(now):
+        if now.is_missing:
             return mixture
         masses = mixture.log_mixture_weights
         heaviest = jnp.max(masses)
         if self.group is not None:
-            groups = component_groups(mixture, self.group(mixture.particles))
+            groups = mixture.component_groups(self.group(mixture.particles))
             is_rival = groups[:, None] == groups[None]
             heaviest = jnp.max(jnp.where(is_rival, masses[None], -jnp.inf), axis=1)
         hopeless = masses < heaviest + jnp.log(self.least_share)
@@ -189,7 +174,7 @@ class Exclusion(AbstractPropagation, ByFeatures):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Lower the weight of every particle by its nearness to the means of other objects."""
-        if mixture.num_components == 1 or is_missing(now):
+        if mixture.num_components == 1 or now.is_missing:
             return mixture
         features, labels = self.features_of(mixture), mixture.component_indicators
         weights = mixture.occupied.astype(features.dtype)
@@ -211,7 +196,7 @@ class Exclusion(AbstractPropagation, ByFeatures):
         if self.group is None:
             return labels, jnp.arange(m, dtype=labels.dtype), jnp.ones_like(masses)
         objects = self.group(mixture.particles)
-        owners = component_groups(mixture, objects)
+        owners = mixture.component_groups(objects)
         of_object = jnp.where(owners[:, None] == owners[None], masses[None], -jnp.inf)
         shares = jnp.exp(masses - jax.nn.logsumexp(of_object, axis=1))
         return objects, owners, jnp.where(mixture.active, shares, 0.0)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import saying, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractRegrouping, Regrouped, Step, is_missing
+from mpfjax.moves.base import AbstractRegrouping, Regrouped, Step
 from mpfjax.operations.prefix_sums import count_upto
 from mpfjax.operations.random import bits
 from mpfjax.operations.stored import take
@@ -74,11 +74,9 @@ class GroupBy(AbstractRegrouping):
 
     group: Callable[[PyTree], Int[Array, " n"] | Bool[Array, " n"]] = eqx.field(static=True)
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, now: Step | None = None
-    ) -> ParticleMixture:
+    def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Regroup the particles, also where there is one component: labels are then all zero."""
-        if is_missing(now):
+        if now.is_missing:
             return mixture
         return self.with_indicators(mixture, *self.regroup(key, mixture))
 

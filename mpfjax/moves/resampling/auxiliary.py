@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Key
 from mpfjax.checks import Rule, saying
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import real_each
-from mpfjax.moves.base import AbstractWrapper, Step, is_missing, unless_waiting
+from mpfjax.moves.base import AbstractWrapper, Step, unless_waiting
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
@@ -62,7 +62,7 @@ class AuxiliaryResample(AbstractWrapper):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Resample every component that is due, looking ahead to y_t, unless that is missing."""
-        if is_missing(now):
+        if now.is_missing:
             return mixture
         log_factors = self._log_factors(mixture, now)
         # Resampling may lose a NaN, or a particle whose look-ahead is infinite.

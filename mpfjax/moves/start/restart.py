@@ -167,7 +167,8 @@ class Restart(AbstractMove):
             require_propagation(now, "draws of x_0 are compared")
         if self.num_observations:
             check_initial_density(now.model, "a state drawn anew from observations")
-        others = [move for move in now.initial_moves if not isinstance(move, AbstractRegrouping)]
+        moves = now.filter.initial_moves
+        others = [move for move in moves if not isinstance(move, AbstractRegrouping)]
         if self.at_start and others:
             who = f"initial_moves: {name_of(others[0])} does more than regroup"
             raise ValueError(f"{who}, but with_initialisation replaces x_0")
@@ -248,9 +249,10 @@ class Restart(AbstractMove):
             within=dataclasses.replace(old.within, log_increment=replaced[-1]),
         )
         moved = both.with_resampled(both.active).normalised_within(old)
+        moves = now.filter.initial_moves
+        groupings = tuple(move for move in moves if isinstance(move, AbstractRegrouping))
         # Grouping, as of x_0, waits for no observation.
-        groupings = [move for move in now.initial_moves if isinstance(move, AbstractRegrouping)]
-        moved = in_turn(key_group, tuple(groupings), moved, None)
+        moved = in_turn(key_group, groupings, moved, dataclasses.replace(now, is_initial=True))
         return jax.tree.map(partial(jnp.where, is_due), moved, old)
 
 

@@ -9,8 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.checks import check
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractPropagation, Step, is_missing
-from mpfjax.moves.regrouping.features import component_groups
+from mpfjax.moves.base import AbstractPropagation, Step
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel, Seen
 from mpfjax.vision.colour import Histograms, normalise
 
@@ -96,7 +95,7 @@ class AdaptAppearance(AbstractPropagation):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Learn from this frame, unless it is missing."""
-        if is_missing(now):
+        if now.is_missing:
             return mixture
         particles = now.model.learn(now.observation, mixture.particles, self.rate)
         return mixture.replace(particles=particles)
@@ -114,4 +113,4 @@ def best_components(
 
 def component_references(mixture: ParticleMixture) -> Int[Array, " m"]:
     """The reference of each component."""
-    return component_groups(mixture, mixture.particles.reference)
+    return mixture.component_groups(mixture.particles.reference)
