@@ -15,6 +15,7 @@ which finish in seconds and show that the command runs, and writes to a folder o
 """
 
 import argparse
+import contextlib
 import inspect
 import json
 import os
@@ -23,7 +24,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial, wraps
 from itertools import product
 from pathlib import Path
@@ -342,3 +343,30 @@ def figures(out: Path, dpi: int = 150, **drawn: Any) -> None:
     """Write each figure under its name, as PNG and PDF."""
     for name, figure in drawn.items():
         write_figure(out / f"{name}.png", figure, dpi=dpi)
+
+
+class Clock:
+    """The seconds that went into each part of the work."""
+
+    def __init__(self, *parts: str) -> None:
+        self.seconds = dict.fromkeys(parts, 0.0)
+
+    @contextlib.contextmanager
+    def of(self, part: str) -> Iterator[None]:
+        """Count the time in the block for this part, and for no part around it."""
+        start, before = time.perf_counter(), sum(self.seconds.values())
+        try:
+            yield
+        finally:
+            within = sum(self.seconds.values()) - before
+            self.seconds[part] += time.perf_counter() - start - within
+
+    def over(self, part: str, items: Iterable[Any]) -> Iterator[Any]:
+        """Yield the items, and count the time that each takes to arrive for this part."""
+        iterator, end = iter(items), object()
+        while True:
+            with self.of(part):
+                item = next(iterator, end)
+            if item is end:
+                return
+            yield item

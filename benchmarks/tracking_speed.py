@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness import Count, command, data, settings_of, table
+from benchmarks.harness import Clock, Count, command, data, settings_of, table
 from benchmarks.peers.worker import process
-from mpfjax.console import Clock, peak_memory
+from mpfjax.console import peak_memory
 from mpfjax.vision import ObjectTracker, track
 
 FEW, MORE, CROWD = (3, 8), (6, 10), (10, 15)  # rows and columns of objects

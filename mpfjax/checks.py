@@ -50,11 +50,7 @@ def is_series(value: Any) -> TypeGuard[Iterable[Any]]:
 
 
 def as_numbers(
-    name: str,
-    value: Any,
-    *,
-    floating: bool = False,
-    may_be_complex: bool = False,
+    name: str, value: Any, *, floating: bool = False, may_be_complex: bool = False
 ) -> Any:
     """The argument as an array of JAX or numpy that holds the same numbers for JAX.
 
@@ -363,13 +359,10 @@ def saying(who: str, clause: str = "") -> Iterator[None]:
         raise
 
 
-def _module_of(frame: types.FrameType) -> str:
-    return frame.f_globals.get("__name__", "")
-
-
 def warn(message: str, category: type[Warning] = RuntimeWarning) -> None:
     """Warn at the line outside of the library from which it was called."""
-    frames = (_module_of(at) for at, _ in traceback.walk_stack(sys._getframe()))
+    stack = traceback.walk_stack(sys._getframe())
+    frames = (frame.f_globals.get("__name__", "") for frame, _ in stack)
     # `warnings.warn` does not count the frames of an import either.
     names = [f"{name}." for name in frames if not name.startswith("importlib.")]
     last = max(depth for depth, name in enumerate(names) if name.startswith("mpfjax."))

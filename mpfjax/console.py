@@ -1,4 +1,4 @@
-"""Shared by all commands: reading numbers, clocks, one-line errors.
+"""Shared by all commands: reading numbers, one-line errors, memory.
 
 A number out of range is an error of argparse, with exit status 2.
 """
@@ -10,9 +10,8 @@ import importlib
 import math
 import os
 import sys
-import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -106,33 +105,6 @@ def say_warnings(category: type[Warning]) -> None:
 
     warnings.filterwarnings("always", category=category)
     warnings.showwarning = show
-
-
-class Clock:
-    """The seconds that went into each part of the work."""
-
-    def __init__(self, *parts: str) -> None:
-        self.seconds = dict.fromkeys(parts, 0.0)
-
-    @contextlib.contextmanager
-    def of(self, part: str) -> Iterator[None]:
-        """Count the time in the block for this part, and for no part around it."""
-        start, before = time.perf_counter(), sum(self.seconds.values())
-        try:
-            yield
-        finally:
-            within = sum(self.seconds.values()) - before
-            self.seconds[part] += time.perf_counter() - start - within
-
-    def over(self, part: str, items: Iterable[Any]) -> Iterator[Any]:
-        """Yield the items, and count the time that each takes to arrive for this part."""
-        iterator, end = iter(items), object()
-        while True:
-            with self.of(part):
-                item = next(iterator, end)
-            if item is end:
-                return
-            yield item
 
 
 def peak_memory() -> float:

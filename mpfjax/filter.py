@@ -185,7 +185,6 @@ class Filter(eqx.Module):
         key: Key[Array, "*keys"],
         observation: PyTree = None,
         inputs: PyTree = None,
-        *,
         particles: PyTree = None,
     ) -> ParticleMixture:
         """The mixture of x_0, of these particles if they are there."""
@@ -224,14 +223,8 @@ class Filter(eqx.Module):
         return mixture.replace(within=None, periods=periods_of(now.model)), report
 
 
-@jit_with_floats_traced
-def _one_step(filter, key, mixture, observation, inputs):
-    return filter._step(key, mixture, observation, inputs)
-
-
-@jit_with_floats_traced
-def _start(filter, keys, observation, inputs, particles):
-    return filter._init(keys, observation, inputs, particles=particles)
+_one_step = jit_with_floats_traced(Filter._step)
+_start = jit_with_floats_traced(Filter._init)
 
 
 def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> ParticleMixture:

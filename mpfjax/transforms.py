@@ -32,10 +32,12 @@ def map_moves(filter: Filter, change: Callable[[Any], Any]) -> Filter:
 
         map_moves(filter, lambda m: Resample("stratified") if isinstance(m, Resample) else m)
     """
-    return _change_kind(filter, AbstractMove, change, within=True)
+    return _change(filter, AbstractMove, change, within=True)
 
 
-def _change_kind(filter: Filter, kind: Any, change: Callable[[Any], Any], within: bool) -> Filter:
+def _change(
+    filter: Filter, kind: Any, change: Callable[[Any], Any], within: bool = False
+) -> Filter:
     """The filter with its moves of this kind changed, also those within propagations or not."""
 
     def visit(move: AbstractMove) -> Any:
@@ -49,17 +51,6 @@ def _change_kind(filter: Filter, kind: Any, change: Callable[[Any], Any], within
     )
 
 
-def _change_in_chain(filter: Filter, kind: Any, change: Callable[[Any], Any]) -> Filter:
-    """The filter with its moves of this kind changed, but none within a propagation."""
-    return _change_kind(filter, kind, change, within=False)
-
-
-def _require_resample(filter: Filter, what: str) -> None:
-    """Raise a `ValueError` for a filter whose chain does not resample by a `Resample`."""
-    if not any(isinstance(move, Resample) for move in all_of(filter.moves, within=False)):
-        raise ValueError(f"filter: none of its moves is a Resample, {what}")
-
-
 @checked
 def with_resampling(filter: Filter, resample: Resample) -> Filter:
     """The filter with this `Resample` instead of the existing one; look-aheads are retained.
@@ -67,7 +58,7 @@ def with_resampling(filter: Filter, resample: Resample) -> Filter:
     Raises `ValueError` for anything but a `Resample`. Use it to change the allocation of particles
     to components: `with_resampling(filter, Resample(allocation="equal"))`.
     """
-    return _change_in_chain(filter, Resample, lambda move: resample)
+    return _change(filter, Resample, lambda move: resample)
 
 
 @checked
@@ -79,9 +70,7 @@ def with_quasi_monte_carlo(filter: Filter) -> Filter:
     `ValueError` for a model or proposal that is not reparameterised. Use it if mixture weights and
     likelihoods must be accurate.
     """
-    ordered = _change_in_chain(
-        filter, Resample, lambda move: dataclasses.replace(move, along_curve=True)
-    )
+    ordered = _change(filter, Resample, lambda move: dataclasses.replace(move, along_curve=True))
     return _everywhere(ordered, "noise", "rqmc").replace(initial_noise="rqmc")
 
 
@@ -114,7 +103,7 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
         plain = move.propagate if isinstance(move, PropagateNested) else move
         return plain if num_draws == 1 else PropagateNested(plain, num_draws)
 
-    return _change_in_chain(filter, AbstractPropagationOfEach, nested)
+    return _change(filter, AbstractPropagationOfEach, nested)
 
 
 @checked
@@ -126,16 +115,17 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
     is a proposal also draws x_t if the filter has no other proposal. Raises `ValueError` for a
     filter without `Resample`.
     """
-    plain = _change_in_chain(filter, AuxiliaryResample, lambda move: move.resample)
+    plain = _change(filter, AuxiliaryResample, lambda move: move.resample)
     look = _lookahead_of(plain) if lookahead is None else lookahead
-    _require_resample(plain, "which could look ahead")
+    if not any(isinstance(move, Resample) for move in all_of(plain.moves, within=False)):
+        raise ValueError("filter: none of its moves is a Resample, which could look ahead")
 
     def guided(move: Propagate) -> Propagate:
         return dataclasses.replace(move, proposal=look) if move.proposal is None else move
 
-    ahead = _change_in_chain(plain, Resample, lambda move: AuxiliaryResample(move, look))
+    ahead = _change(plain, Resample, lambda move: AuxiliaryResample(move, look))
     is_proposal = isinstance(look, AbstractProposal)
-    return _change_in_chain(ahead, Propagate, guided) if is_proposal else ahead
+    return _change(ahead, Propagate, guided) if is_proposal else ahead
 
 
 def _lookahead_of(filter: Filter) -> Lookahead:
@@ -220,7 +210,7 @@ def _with_restart(filter: Filter, **settings: Any) -> Filter:
         )
         restart = Restart(0, at_start=False, probability=None, has_alarm=False)
         filter = filter.replace(moves=[*filter.moves[:place], restart, *filter.moves[place:]])
-    return _change_in_chain(filter, Restart, lambda move: dataclasses.replace(move, **settings))
+    return _change(filter, Restart, lambda move: dataclasses.replace(move, **settings))
 
 
 def _everywhere(filter: Filter, field: str, value: str) -> Filter:

@@ -23,11 +23,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.harness import Folders, Natural, Seed, command, data, table
+from benchmarks.harness import Clock, Folders, Natural, Seed, command, data, table
 from benchmarks.tracking_by_detection import football
 from benchmarks.tracking_by_detection.peers import Peer, installed
 from mpfjax import vision
-from mpfjax.console import Clock
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision.files import frames as files
 from mpfjax.vision.files import sequences

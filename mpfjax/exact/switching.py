@@ -7,14 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.checks import checked
-from mpfjax.exact.kalman import (
-    Law,
-    LinearStep,
-    Moments,
-    checked_rows,
-    filtered,
-    smoothed,
-)
+from mpfjax.exact.kalman import Law, LinearStep, Moments, checked_rows, filtered, smoothed
 from mpfjax.models.linear import SwitchingLinearGaussianModel
 from mpfjax.models.series import series_of, steps_of_inputs
 from mpfjax.operations.logarithms import log_sum_exp
@@ -111,17 +104,14 @@ def _kalman_smoother(
 ) -> tuple[Moments, Moments, Float[Array, " t"]]:
     """Filtered and smoothed moments, and log p(y_s | y_1..y_{s-1}), given the regimes."""
 
-    def of(regime: Int[Array, ""], values: Array | None, *shape: int) -> Array:
-        if values is None:
-            return jnp.zeros(shape, observations.dtype)
-        return values if values.ndim == len(shape) else values[regime]
-
     def step_of(z: Int[Array, ""]) -> LinearStep:
-        dynamics = of(z, model.F, d, d), of(z, model.b, d), of(z, model.Q, d, d)
-        return LinearStep(*dynamics, of(z, model.H, p, d), of(z, model.c, p), of(z, model.R, p, p))
+        parts = *model.dynamics(z[None], z[None]), *model.emission(z[None])
+        ranks = (2, 1, 2, 2, 1, 2)  # of one regime, or of all of them
+        each = zip(parts, ranks, strict=True)
+        return LinearStep(*(part.reshape(part.shape[-rank:]) for part, rank in each))
 
-    d, p = model.m0.shape[-1], observations.shape[1]
-    start = Law.of(of(sequence[0], model.m0, d), of(sequence[0], model.P0, d, d))
+    d, (mean, covariance) = model.m0.shape[-1], model.initial_moments(sequence[:1])
+    start = Law.of(mean.reshape(d), covariance.reshape(d, d))
     laws, increments = filtered(start, step_of, sequence[1:], observations)
     moments = smoothed(start, laws, step_of, sequence[1:])
     return laws.moments, moments, increments

@@ -84,7 +84,7 @@ def learn_lookahead(
     if not is_mixed(model):
         require_noise(model, "learn_lookahead")
     series = as_series(observations, model)
-    twist = _knowing_nothing(key, model, filter.num_components, series.length, features)
+    twist = _knowing_nothing(key, filter, series.length, features)
     learners = _LEARNERS * filter.num_particles
     for pass_key in jax.random.split(key, num_passes):
         run_key, fit_key = jax.random.split(pass_key)
@@ -94,14 +94,9 @@ def learn_lookahead(
     return _twisted(filter, twist, filter.num_particles)
 
 
-def _knowing_nothing(
-    key: Key[Array, ""],
-    model: Any,
-    size: int,
-    length: int,
-    features: Callable[[PyTree], Array] | None,
-) -> Twist:
+def _knowing_nothing(key: Key[Array, ""], filter: Filter, length: int, features: Any) -> Twist:
     """ψ = 1 at every step."""
+    model, size = filter.model, filter.num_components
     of_states = over_particles(model, features) or flatten_states
     states = jax.eval_shape(lambda key: law_of(model).sample_initial(key, 2), key)
     num_features = math.prod(jax.eval_shape(of_states, states).shape[1:])

@@ -11,9 +11,8 @@ from jaxtyping import Array, Bool, Float, Key
 from mpfjax.filter import Filter
 from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.lookahead.twisted import Twist
-from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import with_inputs
-from mpfjax.models.law import law_of
+from mpfjax.models.law import Law, law_of
 from mpfjax.models.series import Series
 from mpfjax.running.results import FilterRun
 
@@ -42,8 +41,8 @@ def fit_lookahead(
 
     def back(after: LocalQuadratics, step: Any) -> tuple[LocalQuadratics, LocalQuadratics]:
         key, used, mixture, now = step
-        model = with_inputs(filter.model, now.inputs)
-        points = _draw_points(key, model, twist, used, after, mixture, now)
+        law = law_of(with_inputs(filter.model, now.inputs))
+        points = _draw_points(key, law, twist, after, step[1:])
         fitted = _fit_step(points, used)
         # ν with a mean of 1 over the filtering distribution, and its floor, δ of that mean.
         log_fitted = fitted.log_fitted(twist.features_of(mixture.particles))
@@ -63,8 +62,7 @@ def fit_lookahead(
     whole = jax.tree.map(lambda some, end: jnp.concatenate([some, end[None]]), fitted, last)
     initial = twist.initial
     if initial is not None:
-        learned = (filter.model, filter.num_particles, twist, initial, first)
-        initial = _if_finite(_fit_initial(key_initial, *learned), initial)
+        initial = _if_finite(_fit_initial(key_initial, filter, twist, initial, first), initial)
     return Twist(whole, initial, twist.features)
 
 
@@ -86,17 +84,12 @@ class _Points(NamedTuple):
 
 
 def _draw_points(
-    key: Key[Array, ""],
-    model: Any,
-    twist: Twist,
-    used: LocalQuadratics,
-    after: LocalQuadratics,
-    mixture: ParticleMixture,
-    now: Series,
+    key: Key[Array, ""], law: Law, twist: Twist, after: LocalQuadratics, step: tuple
 ) -> _Points:
     """Draw every particle with equal frequency, so that none is lost, with noise from q_t."""
+    used, mixture, now = step
     num_experts, dimension = used.centres.shape
-    num_noises = law_of(model).noise_dimension(mixture.particles)
+    num_noises = law.noise_dimension(mixture.particles)
     num_coefficients = _num_coefficients(dimension + num_noises)
     needed = _PARTICLES_A_COEFFICIENT * num_coefficients
     copies = -(-2 * needed * num_experts // mixture.num_particles)
@@ -105,8 +98,8 @@ def _draw_points(
     features = twist.features_of(states)
     shape = (len(log_weights), num_noises + 1)
     noise, log_ratio = used.draw(jax.random.normal(key, shape, features.dtype), features)
-    unseen = law_of(model).complete(law_of(model).make(noise, states), states)
-    moved, log_factors = law_of(model).see(now.observations, unseen)
+    unseen = law.complete(law.make(noise, states), states)
+    moved, log_factors = law.see(now.observations, unseen)
     log_likelihoods = sum(log_factors[1:], log_factors[0])
     if (present := now.present) is not None:
         log_likelihoods = jnp.where(present, log_likelihoods, 0.0)
@@ -152,25 +145,18 @@ def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
 
 
 def _fit_initial(
-    key: Key[Array, ""],
-    model: Any,
-    num_particles: int,
-    twist: Twist,
-    used: LocalQuadratics,
-    first: LocalQuadratics,
+    key: Key[Array, ""], filter: Filter, twist: Twist, used: LocalQuadratics, first: LocalQuadratics
 ) -> LocalQuadratics:
     """A Gaussian mixture in the noise of x_0: the moments near each expert of ψ_1."""
     num_experts, dimension = used.noise_means.shape
     needed = _PARTICLES_A_COEFFICIENT * _num_coefficients(dimension)
-    size = max(4 * num_particles, 4 * needed * num_experts)
+    size = 4 * max(filter.num_particles, needed * num_experts)
     key_used, key_fitted = jax.random.split(key)
 
     def draw(key: Key[Array, ""], psi: LocalQuadratics) -> tuple[Array, Array, Array]:
-        shape = (size, dimension + 1)
-        dtype = used.slopes.dtype
-        standard = jax.random.normal(key, shape, dtype)
-        noise, log_ratio = psi.draw(standard, jnp.zeros((size, 1), dtype))
-        features = twist.features_of(law_of(model).make_initial(noise))
+        standard = jax.random.normal(key, (size, dimension + 1), used.slopes.dtype)
+        noise, log_ratio = psi.draw(standard, jnp.zeros_like(standard[:, :1]))
+        features = twist.features_of(law_of(filter.model).make_initial(noise))
         return noise, features, first.log_fitted(features) + log_ratio
 
     noise, features, log_importance = draw(key_used, used)

@@ -21,7 +21,7 @@ from mpfjax.moves.base import (
     AbstractWrapper,
     Step,
 )
-from mpfjax.moves.propagation.propagate import noise_of_slots
+from mpfjax.moves.propagation.propagate import noise_of_slots, weigh
 from mpfjax.operations.logarithms import log_sum_exp
 
 
@@ -105,8 +105,7 @@ class PropagateTwisted(AbstractPropagation, AbstractWrapper):
         psi = self.twist.at(mixture.t)
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
         states = law.complete(law.make(drawn, previous), previous)
-        states, log_factors = law.see(now.observation, states)
-        return mixture.replace(particles=states).reweight(*log_factors, log_ratio)
+        return weigh(mixture.replace(particles=states), now, log_ratio)
 
 
 class RegroupTwisted(AbstractWrapper, AbstractRegrouping):

@@ -160,12 +160,7 @@ class MarginalisedLaw(Law):
 class MixedLaw(MarginalisedLaw):
     """The law of a conditionally linear model whose z_t depends on x_{t-1}; z_t is then normal."""
 
-    has_density = True
-
-    @property
-    def is_of_noise(self) -> bool:
-        """True: z_t is normal."""
-        return True
+    has_density = is_of_noise = True
 
     def draw(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """z_t, drawn from its normal law."""

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from mpfjax.operations.matrices import coordinates, total, transform
 from mpfjax.operations.stored import stored
 
+Squares = Float[Array, "d d #n"]
 # The least variance, in units of the rounding error of the numbers it was computed from.
 _ROUNDINGS = 4
 
@@ -63,7 +64,7 @@ def sandwich(
     return symmetric(product(product(matrix, covariance), transpose(matrix)))
 
 
-def cholesky(matrix: Float[Array, "d d #n"], floor: bool = False) -> Float[Array, "d d n"]:
+def cholesky(matrix: Squares, floor: bool = False) -> Float[Array, "d d n"]:
     """The lower triangular L with L Lᵀ = A, for positive semidefinite A.
 
     A direction without variance, but for rounding, gets a column of zeros; with `floor` the root of
@@ -78,9 +79,7 @@ def cholesky(matrix: Float[Array, "d d #n"], floor: bool = False) -> Float[Array
     return factor * (roots if floor else jnp.where(variances > 0, roots, 0.0))[None]
 
 
-def solve_lower(
-    factor: Float[Array, "d d #n"], right: Float[Array, "d e #n"]
-) -> Float[Array, "d e n"]:
+def solve_lower(factor: Squares, right: Float[Array, "d e #n"]) -> Float[Array, "d e n"]:
     """L⁻¹ B, by forward substitution."""
     rows: list[Array] = []
     for i in range(factor.shape[0]):
@@ -91,17 +90,13 @@ def solve_lower(
     return jnp.stack(rows)
 
 
-def solve_upper(
-    factor: Float[Array, "d d #n"], right: Float[Array, "d e #n"]
-) -> Float[Array, "d e n"]:
+def solve_upper(factor: Squares, right: Float[Array, "d e #n"]) -> Float[Array, "d e n"]:
     """L⁻ᵀ B of the lower triangular L, by backward substitution."""
     # Mirrored, the upper triangle is a lower one.
     return solve_lower(transpose(factor)[::-1, ::-1], right[::-1])[::-1]
 
 
-def without_correlations(
-    matrix: Float[Array, "d d #n"],
-) -> tuple[Float[Array, "d d n"], Float[Array, "d n"]]:
+def without_correlations(matrix: Squares) -> tuple[Float[Array, "d d n"], Float[Array, "d n"]]:
     """L with ones on its diagonal, and D >= 0, with L diag(D) Lᵀ = A, positive semidefinite.
 
     An entry of D that is zero, but for rounding, gets a column of L without any other entry.

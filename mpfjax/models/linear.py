@@ -26,11 +26,12 @@ PROBABILITIES = entries(
     "probabilities, rows that sum to one",
 )
 # One of all regimes, or one for each.
-VectorOfEach = Float[Array, " d"] | Float[Array, "k d"]
+VectorOfEach = Annotated[Float[Array, " d"] | Float[Array, "k d"], FINITE]
 SquareOfEach = Float[Array, "d d"] | Float[Array, "k d d"]
 RowsOfEach = Float[Array, "p d"] | Float[Array, "k p d"]
 NoiseOfEach = Float[Array, "p p"] | Float[Array, "k p p"]
-OffsetOfEach = Float[Array, " p"] | Float[Array, "k p"]
+OffsetOfEach = Annotated[Float[Array, " p"] | Float[Array, "k p"], FINITE]
+States = Float[Array, "n d"]
 Regimes = Int[Array, " n"]
 Parts = Float[Array, "..."]
 
@@ -72,7 +73,7 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
         """B u_t; None if there is no B, or no u_t."""
         return None if self.B is None or self.inputs is None else self.B @ self.inputs
 
-    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> States:
         """x_0 ~ N(m0, P0)."""
         noise = normal(key, (num_particles, self.initial_noise_dimension), self.m0.dtype)
         return self.initial_from_noise(noise)
@@ -82,48 +83,40 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
         """d."""
         return self.m0.shape[0]
 
-    def initial_from_noise(self, noise: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    def initial_from_noise(self, noise: Float[Array, "n d"]) -> States:
         """x_0 ~ N(m0, P0)."""
         return self.m0[None] + noise @ _root(self.P0).T
 
     noise_dimension = initial_noise_dimension
 
-    def transition_from_noise(
-        self, noise: Float[Array, "n d"], states: Float[Array, "n d"]
-    ) -> Float[Array, "n d"]:
+    def transition_from_noise(self, noise: Float[Array, "n d"], states: States) -> States:
         """x_t ~ N(A x_{t-1} + B u_t, Q)."""
         return self.transition_mean(states) + noise @ _root(self.Q).T
 
-    def log_likelihood(
-        self, observation: Float[Array, " p"], states: Float[Array, "n d"]
-    ) -> Float[Array, " n"]:
+    def log_likelihood(self, observation: Float[Array, " p"], states: States) -> Float[Array, " n"]:
         """log N(y_t; H x_t, R)."""
         check_shape(f"{self.H.shape[0]}", observation=observation)
         return log_multinormal(observation[None] - self.observation_mean(states), self.R)
 
-    def sample_observation(
-        self, key: Key[Array, ""], states: Float[Array, "n d"]
-    ) -> Float[Array, "n p"]:
+    def sample_observation(self, key: Key[Array, ""], states: States) -> Float[Array, "n p"]:
         """y_t ~ N(H x_t, R) of every state."""
         noise = normal(key, (len(states), self.R.shape[0]), self.R.dtype)
         return self.observation_mean(states) + noise @ _root(self.R).T
 
-    def log_transition(
-        self, states: Float[Array, "n d"], previous_states: Float[Array, "n d"]
-    ) -> Float[Array, " n"]:
+    def log_transition(self, states: States, previous_states: States) -> Float[Array, " n"]:
         """log N(x_t; A x_{t-1} + B u_t, Q)."""
         return log_multinormal(states - self.transition_mean(previous_states), self.Q)
 
-    def log_initial(self, states: Float[Array, "n d"]) -> Float[Array, " n"]:
+    def log_initial(self, states: States) -> Float[Array, " n"]:
         """log N(x_0; m0, P0)."""
         return log_multinormal(states - self.m0[None], self.P0)
 
-    def transition_mean(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    def transition_mean(self, states: States) -> States:
         """A x_{t-1} + B u_t."""
         mean = states @ self.A.T
         return mean if self.control is None else mean + self.control[None]
 
-    def observation_mean(self, states: Float[Array, "n d"]) -> Float[Array, "n p"]:
+    def observation_mean(self, states: States) -> Float[Array, "n p"]:
         """H x_t."""
         return states @ self.H.T
 
@@ -166,14 +159,10 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
     Q: Annotated[SquareOfEach, COVARIANCE] = eqx.field(converter=to_array("Q"))
     H: Annotated[RowsOfEach, FINITE] = eqx.field(converter=to_array("H"))
     R: Annotated[NoiseOfEach, COVARIANCE] = eqx.field(converter=to_array("R"))
-    m0: Annotated[VectorOfEach, FINITE] = eqx.field(converter=to_array("m0"))
+    m0: VectorOfEach = eqx.field(converter=to_array("m0"))
     P0: Annotated[SquareOfEach, COVARIANCE] = eqx.field(converter=to_array("P0"))
-    b: Annotated[VectorOfEach, FINITE] | None = eqx.field(
-        converter=to_array("b"), default=None, kw_only=True
-    )
-    c: Annotated[OffsetOfEach, FINITE] | None = eqx.field(
-        converter=to_array("c"), default=None, kw_only=True
-    )
+    b: VectorOfEach | None = eqx.field(converter=to_array("b"), default=None, kw_only=True)
+    c: OffsetOfEach | None = eqx.field(converter=to_array("c"), default=None, kw_only=True)
     initial_probabilities: Annotated[Float[Array, " k"], PROBABILITIES] | None = eqx.field(
         converter=to_array("initial_probabilities"), default=None, kw_only=True
     )

@@ -14,6 +14,7 @@ from mpfjax.models.gaussians import log_normal
 from mpfjax.models.noise import stratified_uniform
 from mpfjax.operations.random import normal, uniform
 
+States = Float[Array, " n"]
 Deviation = Annotated[Float[Array, ""], POSITIVE]
 
 
@@ -46,7 +47,7 @@ class QuadraticModel(AbstractStateSpaceModel, Fitting):
         if not self.low < self.high:
             raise ValueError(f"high: {self.high} is not above low, {self.low}")
 
-    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, " n"]:
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> States:
         """x_0, uniform on [low, high]."""
         if self.initial_draw == "stratified":
             shares = stratified_uniform(key, num_particles)
@@ -56,46 +57,38 @@ class QuadraticModel(AbstractStateSpaceModel, Fitting):
 
     noise_dimension = initial_noise_dimension = 1
 
-    def initial_from_noise(self, noise: Float[Array, "n 1"]) -> Float[Array, " n"]:
+    def initial_from_noise(self, noise: Float[Array, "n 1"]) -> States:
         """x_0, uniform on [low, high]."""
         return self.low + (self.high - self.low) * jax.scipy.special.ndtr(noise[:, 0])
 
-    def transition_from_noise(
-        self, noise: Float[Array, "n 1"], states: Float[Array, " n"]
-    ) -> Float[Array, " n"]:
+    def transition_from_noise(self, noise: Float[Array, "n 1"], states: States) -> States:
         """x_t ~ N(x_{t-1}, σ_x²)."""
         return states + self.sigma_x * noise[:, 0]
 
-    def log_likelihood(
-        self, observation: Float[Array, ""], states: Float[Array, " n"]
-    ) -> Float[Array, " n"]:
+    def log_likelihood(self, observation: Float[Array, ""], states: States) -> Float[Array, " n"]:
         """log N(y_t; x_t², σ_y²); raises `ValueError` for an observation that is no scalar."""
         if jnp.ndim(observation) != 0:
             raise ValueError(f"observation: shape {jnp.shape(observation)} is not that of a scalar")
         return log_normal(observation - states**2, self.sigma_y)
 
-    def sample_observation(
-        self, key: Key[Array, ""], states: Float[Array, " n"]
-    ) -> Float[Array, " n"]:
+    def sample_observation(self, key: Key[Array, ""], states: States) -> Float[Array, " n"]:
         """y_t ~ N(x_t², σ_y²) of every state."""
         return states**2 + self.sigma_y * normal(key, states.shape, states.dtype)
 
-    def log_transition(
-        self, states: Float[Array, " n"], previous_states: Float[Array, " n"]
-    ) -> Float[Array, " n"]:
+    def log_transition(self, states: States, previous_states: States) -> Float[Array, " n"]:
         """log N(x_t; x_{t-1}, σ_x²)."""
         return log_normal(states - previous_states, self.sigma_x)
 
-    def log_initial(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
+    def log_initial(self, states: States) -> Float[Array, " n"]:
         """log p(x_0), uniform on [low, high]."""
         inside = (states >= self.low) & (states <= self.high)
         return jnp.where(inside, -jnp.log(self.high - self.low), -jnp.inf)
 
-    def transition_mean(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
+    def transition_mean(self, states: States) -> Float[Array, " n"]:
         """x_{t-1}."""
         return states
 
-    def observation_mean(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
+    def observation_mean(self, states: States) -> Float[Array, " n"]:
         """x_t²."""
         return states**2
 

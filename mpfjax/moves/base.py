@@ -18,6 +18,7 @@ from mpfjax.models.law import Law, law_of
 from mpfjax.operations.random import split
 
 Gradient = Literal["none", "stop"]
+Groups = Callable[[PyTree], Int[Array, " n"]]  # the number of the group of each particle
 
 
 class Step(eqx.Module):

@@ -20,6 +20,7 @@ from jax.core import Tracer
 from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import PyTree
 
+Options = dict[str, int | str]
 # Since this version XLA sums on vectors, and long rows by a library, in any order.
 _SUMS_ON_VECTORS = (0, 10)
 _FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
@@ -28,7 +29,7 @@ _CACHE_FOLDER = "jax_compilation_cache_dir"
 
 def cpu_options(
     soon: bool = False, one_thread: bool = False, *, older_emitters: bool = False
-) -> dict[str, int | str]:
+) -> Options:
     """The compiler's options on a CPU: vectors of 512 bits, and sums in one piece.
 
     XLA's default is vectors of 256 bits; a machine without wider ones uses its widest. By default
@@ -55,9 +56,7 @@ def cpu_options(
     return {name: value for name, value in options.items() if name not in flags}
 
 
-def jit_with(
-    options: dict[str, int | str], function: Callable[..., PyTree]
-) -> Callable[..., PyTree]:
+def jit_with(options: Options, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """`equinox.filter_jit` with options of the compiler."""
     # Its type does not have them.
     return cast(Any, eqx.filter_jit)(function, compiler_options=options)
@@ -97,7 +96,7 @@ def jit_on_wide_vectors(
     return run
 
 
-def in_little_memory(soon: bool = False) -> dict[str, int | str]:
+def in_little_memory(soon: bool = False) -> Options:
     """The compiler's options by which a large program is compiled in little memory on a CPU.
 
     XLA's newer emitters of fused operations take some 250 MB more for a program of a few thousand
@@ -111,8 +110,8 @@ def in_little_memory(soon: bool = False) -> dict[str, int | str]:
 
 
 @functools.cache
-def _older_emitters() -> dict[str, int | str]:
-    options: dict[str, int | str] = {_FUSION_EMITTERS: False}
+def _older_emitters() -> Options:
+    options: Options = {_FUSION_EMITTERS: False}
     try:
         jax.jit(jnp.negative, compiler_options=options)(1.0)
     except jax.errors.JaxRuntimeError:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.stored import on_platform, stored
 
+Words = UInt32[Array, " *shape"]
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
 _SHORT_ROW = 8
@@ -164,11 +165,7 @@ def _log(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 def _polynomial(coefficients: Iterable[Any], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """The polynomial; the coefficient of the highest power comes first."""
-    highest, *others = coefficients
-    value = highest
-    for coefficient in others:
-        value = value * x + coefficient
-    return value
+    return functools.reduce(lambda value, coefficient: value * x + coefficient, coefficients)
 
 
 def _random_bits(key: UInt32[Array, " 2"], bit_width: int, shape: tuple[int, ...]) -> Array:
@@ -189,9 +186,7 @@ def _words(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, ".
     return high ^ low
 
 
-def threefry(
-    key: Any, high: UInt32[Array, " *shape"], low: UInt32[Array, " *shape"]
-) -> tuple[UInt32[Array, " *shape"], UInt32[Array, " *shape"]]:
+def threefry(key: Any, high: Words, low: Words) -> tuple[Words, Words]:
     """Threefry-2x32 with 20 rounds: the counter (high, low) encrypted under `key`."""
     keys = (key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(_PARITY))
     high, low = high + keys[0], low + keys[1]
@@ -203,9 +198,7 @@ def threefry(
 
 
 @partial(jax.jit, static_argnums=2)
-def _rounds(
-    high: UInt32[Array, " *shape"], low: UInt32[Array, " *shape"], rotations: tuple[int, ...]
-) -> tuple[UInt32[Array, " *shape"], UInt32[Array, " *shape"]]:
+def _rounds(high: Words, low: Words, rotations: tuple[int, ...]) -> tuple[Words, Words]:
     for rotation in rotations:
         high = high + low
         low = high ^ ((low << rotation) | (low >> (32 - rotation)))

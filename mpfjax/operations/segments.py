@@ -85,14 +85,6 @@ def are_masked(n: int, num_segments: int) -> bool:
     return num_segments <= FEW_SEGMENTS or n * num_segments <= _FEW_MASKED
 
 
-@partial(jax.jit, static_argnames="num_segments")
-def segment_max(
-    values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
-) -> Float[Array, " num_segments"]:
-    """The largest value in each segment, -inf in an empty one."""
-    return segment_reduce("max", values, segments, num_segments, -jnp.inf)
-
-
 def segment_reduce(
     how: str,
     values: Shaped[Array, " n"],
@@ -163,7 +155,9 @@ def scaled_exp_of_segments(
     log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> tuple[Float[Array, " n"], Float[Array, " num_segments"]]:
     """exp of the values divided by their segment's largest, and the logarithm of that."""
-    shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
+    constants = jax.lax.stop_gradient(log_values)
+    largest = segment_reduce("max", constants, segments, num_segments, -jnp.inf)
+    shift = finite_or_zero(largest)
     return exp(log_values - spread(shift, segments)), shift
 
 
@@ -190,7 +184,7 @@ def segment_argmax(
     values = jax.lax.stop_gradient(values)  # an index has no derivative
     limits = jnp.finfo(values.dtype)
     values = jnp.clip(values, limits.min, limits.max)
-    largest = jnp.maximum(segment_max(values, segments, num_segments), limits.min)
+    largest = segment_reduce("max", values, segments, num_segments, limits.min)
     is_largest = values >= spread(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     if not are_masked(n, num_segments):

@@ -34,6 +34,7 @@ from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.random import split, uniform
 from mpfjax.operations.stored import take
 
+Table = Float[Array, "objects n"]
 _GOLDEN = (np.sqrt(5) - 1) / 2
 
 
@@ -119,7 +120,7 @@ class PropagateInClusters(AbstractPropagationByObject):
         """
         model = now.model
         if now.is_missing:
-            return predict(key, model, mixture, "none")
+            return predict(key, now.law, mixture, "none", "independent")
         require_equal_rows(mixture, "PropagateInClusters")
         num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
@@ -151,7 +152,7 @@ class PropagateInClusters(AbstractPropagationByObject):
 
         def impossible() -> ParticleMixture:
             nothing = jnp.full((1,), -jnp.inf, mixture.log_weights.dtype)
-            return predict(key, model, mixture, "none").reweight(nothing)
+            return predict(key, now.law, mixture, "none", "independent").reweight(nothing)
 
         return jax.lax.cond(log_growth == -jnp.inf, impossible, lambda: moved)
 
@@ -161,7 +162,7 @@ class PropagateInClusters(AbstractPropagationByObject):
         keys: tuple,
         particles: PyTree,
         points: PyTree,
-        log_likelihoods: Float[Array, "objects n"],
+        log_likelihoods: Table,
         labels: Int[Array, " objects"],
     ) -> tuple[PyTree, Float[Array, ""]]:
         """The clusters' new rows, of equal weight, and log of their factors of Ẑ."""
@@ -191,10 +192,7 @@ class PropagateInClusters(AbstractPropagationByObject):
         return particles, log_growth + log_gain
 
     def _resample_rows(
-        self,
-        keys: Key[Array, " objects"],
-        labels: Int[Array, " objects"],
-        log_weights: Float[Array, "objects n"],
+        self, keys: Key[Array, " objects"], labels: Int[Array, " objects"], log_weights: Table
     ) -> tuple[Int[Array, "objects n"], Float[Array, ""]]:
         """Each object's rows drawn anew, alike in a cluster, and log Π of the mean weights."""
         rows, log_growths = draw_rows(take(keys, labels), log_weights)
@@ -244,9 +242,9 @@ def scores(
     model: MultiObjectModel,
     particles: PyTree,
     points: PyTree,
-    log_likelihoods: Float[Array, "objects n"],
+    log_likelihoods: Table,
     alone: Bool[Array, " objects"],
-) -> tuple[Float[Array, "objects n"], Float[Array, "objects n"]]:
+) -> tuple[Table, Table]:
     """log Σ_r f_j(x^{jl} | row r) of each point, and log Σ_l b_rjl of each row.
 
     An object alone needs neither: the score of its row is the likelihood of its own point.
@@ -274,10 +272,10 @@ def recombine(
     particles: PyTree,
     points: PyTree,
     rows: Int[Array, "objects n"],
-    log_point_weights: Float[Array, "objects n"],
-    log_sums: Float[Array, "objects n"],
+    log_point_weights: Table,
+    log_sums: Table,
     together: Bool[Array, "objects objects"],
-) -> tuple[PyTree, Float[Array, "objects n"]]:
+) -> tuple[PyTree, Table]:
     """The points that each row takes, and the factor of its cluster's weight."""
     num_objects, num_particles = log_sums.shape
     key_start, key_points = split(key, 2)

@@ -61,7 +61,7 @@ class PropagateIndependently(AbstractPropagationByObject):
         """One step of every object's filter; where y_t is missing, a prediction."""
         model = now.model
         if now.is_missing:
-            return predict(key, model, mixture, "none")
+            return predict(key, now.law, mixture, "none", "independent")
         require_equal_rows(mixture, "PropagateIndependently")
         num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.

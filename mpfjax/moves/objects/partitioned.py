@@ -81,16 +81,11 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
         """Whether components return to their previous weight."""
         return self.reassembly == "prior"
 
-    @property
-    def _stops_draws(self) -> bool:
-        return self.resample.gradient == "stop"
-
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate and weigh the objects of every particle in its component's order."""
-        model = now.model
-        gradient = "stop" if self._stops_draws else "none"
+        model, gradient = now.model, self.resample.gradient
         if now.is_missing:
-            return predict(key, model, mixture, gradient)
+            return predict(key, now.law, mixture, gradient, "independent")
         num_objects = model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects)
@@ -121,7 +116,8 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
         def predicted() -> ParticleMixture:
             # Without weights: the step is then one of zero likelihood.
             nothing = jnp.full_like(mixture.log_weights, -jnp.inf)
-            unseen = predict(key, model, mixture, gradient).replace(log_weights=nothing)
+            unseen = predict(key, now.law, mixture, gradient, "independent")
+            unseen = unseen.replace(log_weights=nothing)
             return jax.tree.map(lambda new, old: jnp.where(lost, new, old), unseen, moved)
 
         return cond_if_any(lost, predicted, lambda: moved)
@@ -140,11 +136,11 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
         objects = _of_particles(orders[:, rank], mixture)
         previous = model.object_states(particles, objects)
         states = model.sample_object_transition(key, previous, objects)
-        if self._stops_draws:
+        if self.resample.gradient == "stop":
             states = jax.lax.stop_gradient(states)
         log_factors = model.object_log_likelihood(observation, states, objects)
         log_factors = log_factors.astype(mixture.log_weights.dtype)
-        if self._stops_draws:
+        if self.resample.gradient == "stop":
             log_density = model.object_log_transition(states, previous, objects)
             log_factors = add_gradient(log_factors, log_density.astype(log_factors.dtype))
         moved = mixture.reweight(log_factors)

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Renamed
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, check_moved, require, require_noise
-from mpfjax.models.law import law_of
+from mpfjax.models.base import check_moved, require, require_noise
+from mpfjax.models.law import Law
 from mpfjax.models.noise import Noise, draw_noise, noise_dtype
 from mpfjax.moves.base import (
     AbstractPropagation,
@@ -36,7 +36,7 @@ class Draw(AbstractPropagation):
         model, proposal, needs_noise = now.model, self.proposal, self.noise != "independent"
         if proposal is not None:
             proposal.check(now)
-        has_density = law_of(model).has_density
+        has_density = now.law.has_density
         if not has_density and (self.gradient == "stop" or proposal is not None):
             require(model, "log_transition", "gradient='stop' or a proposal")
         if needs_noise and proposal is not None:
@@ -48,7 +48,7 @@ class Draw(AbstractPropagation):
         """Propagate every particle and weigh it by y_t; without it, by the model's own law."""
         proposal, previous, law = self.proposal, mixture.particles, now.law
         if proposal is None or now.is_missing:
-            mixture = predict(key, now.model, mixture, self.gradient, self.noise)
+            mixture = predict(key, law, mixture, self.gradient, self.noise)
             return mixture if now.is_missing else self.reweight(mixture, now)
         draws, log_density = _propose(proposal, key, self.noise, mixture, now)
         check_moved(draws, law.part(previous), proposal, "propose")
@@ -67,13 +67,11 @@ class Draw(AbstractPropagation):
         log_density: Float[Array, " n"] | None = None,
     ) -> ParticleMixture:
         """The weights of x_t times L, and D / q where each has been drawn with a log q."""
-        law, states, log_factors = now.law, mixture.particles, []
-        if self.weighs:
-            states, log_factors = law.see(now.observation, states)
+        log_factors = []
         if log_density is not None:
-            draws = law.part(mixture.particles)
-            log_factors.append(law.log_transition(draws, previous) - log_density)
-        return mixture.replace(particles=states).reweight(*log_factors)
+            draws = now.law.part(mixture.particles)
+            log_factors = [now.law.log_transition(draws, previous) - log_density]
+        return weigh(mixture, now, *log_factors) if self.weighs else mixture.reweight(*log_factors)
 
     def around(self, reference: Any) -> AbstractPropagation:
         """The move around the trajectory, where noise and proposal allow it."""
@@ -136,10 +134,13 @@ class Reweight(AbstractPropagation):
 
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Reweight every particle by y_t, unless it is missing."""
-        if now.is_missing:
-            return mixture
-        states, log_factors = now.law.see(now.observation, mixture.particles)
-        return mixture.replace(particles=states).reweight(*log_factors)
+        return mixture if now.is_missing else weigh(mixture, now)
+
+
+def weigh(mixture: ParticleMixture, now: Step, *log_factors: Array) -> ParticleMixture:
+    """The particles of x_t updated and weighted by y_t, and by further factors."""
+    states, log_likelihoods = now.law.see(now.observation, mixture.particles)
+    return mixture.replace(particles=states).reweight(*log_likelihoods, *log_factors)
 
 
 def _propose(
@@ -164,14 +165,10 @@ def noise_of_slots(
 
 
 def predict(
-    key: Key[Array, ""],
-    model: AbstractStateSpaceModel,
-    mixture: ParticleMixture,
-    gradient: str,
-    noise: str = "independent",
+    key: Key[Array, ""], law: Law, mixture: ParticleMixture, gradient: str, noise: str
 ) -> ParticleMixture:
     """Draws of x_t, with the weights' derivatives times D / ⊥D where the draws have none."""
-    law, states, log_weights = law_of(model), mixture.particles, mixture.log_weights
+    states, log_weights = mixture.particles, mixture.log_weights
     # The noise may be that of a proposal alone.
     if noise != "independent" and law.is_of_noise:
         draws = law.make(noise_of_slots(key, noise, law.noise_dimension(states), mixture), states)

@@ -19,6 +19,8 @@ from mpfjax.moves.base import AbstractProposal, Step
 from mpfjax.operations.matrices import cholesky, solve_lower
 from mpfjax.operations.random import normal
 
+States = Float[Array, "n ..."]
+
 
 class _Gaussian(NamedTuple):
     """N(mean, F Fᵀ) of every particle."""
@@ -61,24 +63,22 @@ class _GaussianProposal(ProposalOfNoise):
     """A proposal whose draw is made of as many normal numbers as the state has."""
 
     @abc.abstractmethod
-    def _law(self, now: Step, previous_states: Float[Array, "n ..."]) -> _Gaussian:
+    def _law(self, now: Step, previous_states: States) -> _Gaussian:
         """q of every particle."""
 
-    def noise_dimension(self, previous_states: Float[Array, "n ..."]) -> int:
+    def noise_dimension(self, previous_states: States) -> int:
         """d."""
         return math.prod(previous_states.shape[1:])
 
     def propose_from_noise(
-        self, noise: Float[Array, "n d"], now: Step, previous_states: Float[Array, "n ..."]
-    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
+        self, noise: Float[Array, "n d"], now: Step, previous_states: States
+    ) -> tuple[States, Float[Array, " n"]]:
         """x_t from this noise, and log q of each."""
         law = self._law(now, previous_states)
         states = (law.means + law.forth(noise)).reshape(previous_states.shape)
         return states, law.log_density(noise)
 
-    def log_density(
-        self, now: Step, states: Float[Array, "n ..."], previous_states: Float[Array, "n ..."]
-    ) -> Float[Array, " n"]:
+    def log_density(self, now: Step, states: States, previous_states: States) -> Float[Array, " n"]:
         """log q(x_t | x_{t-1}, y_t) of every particle."""
         law = self._law(now, previous_states)
         return law.log_density(law.back(states.reshape(law.means.shape) - law.means))
@@ -125,7 +125,7 @@ class NetworkProposal(_GaussianProposal):
         last = jax.tree.map(lambda leaf: 0.1 * leaf, network.layers[-1])
         return cls(eqx.tree_at(lambda net: net.layers[-1], network, last), scale)
 
-    def _law(self, now: Step, previous_states: Float[Array, "n ..."]) -> _Gaussian:
+    def _law(self, now: Step, previous_states: States) -> _Gaussian:
         previous = previous_states.reshape(previous_states.shape[0], -1)
         observation = ravel_pytree(now.observation)[0].astype(previous.dtype)
         rows = jnp.broadcast_to(observation, (previous.shape[0], observation.shape[0]))
@@ -166,7 +166,7 @@ class GaussNewtonProposal(_GaussianProposal):
         for mean in ("transition_mean", "observation_mean"):
             require(now.model, mean, "GaussNewtonProposal")
 
-    def _law(self, now: Step, previous_states: Float[Array, "n ..."]) -> _Gaussian:
+    def _law(self, now: Step, previous_states: States) -> _Gaussian:
         means, factors = self._fit(now, previous_states)
         log_scale = means.shape[1] * math.log(self.inflation)
         return _Gaussian(
@@ -176,9 +176,7 @@ class GaussNewtonProposal(_GaussianProposal):
             back=lambda gaps: jnp.einsum("nij,ni->nj", factors, gaps) / self.inflation,
         )
 
-    def log_normaliser(
-        self, now: Step, previous_states: Float[Array, "n ..."]
-    ) -> Float[Array, " n"]:
+    def log_normaliser(self, now: Step, previous_states: States) -> Float[Array, " n"]:
         """log p(y_t | x_{t-1}) of every particle by the fitted Gaussian, shape (n,).
 
         Laplace's approximation of log ∫ L D dx_t: log L + log D at the mean, and the volume
@@ -192,7 +190,7 @@ class GaussNewtonProposal(_GaussianProposal):
         return log_densities + 0.5 * means.shape[1] * math.log(2 * math.pi) - _log_diagonal(factors)
 
     def _fit(
-        self, now: Step, previous_states: Float[Array, "n ..."]
+        self, now: Step, previous_states: States
     ) -> tuple[Float[Array, "n d"], Float[Array, "n d d"]]:
         """The means of q, and the Cholesky factors of the precisions Λ."""
         model = now.model

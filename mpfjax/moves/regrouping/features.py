@@ -19,6 +19,7 @@ from mpfjax.operations.stored import stored
 # Up to this many features are multiplied one by one, which runs on vectors.
 _FEW_FEATURES = 8
 Scale = ArrayLike | Sequence[float]
+Rows = Float[Array, "n k"]  # the features of each particle
 
 
 class ByFeatures(Checked):
@@ -37,7 +38,7 @@ class ByFeatures(Checked):
         static=True, default=(1.0,), converter=to_numbers("scale"), kw_only=True
     )
 
-    def features_of(self, mixture: ParticleMixture) -> Float[Array, "n k"]:
+    def features_of(self, mixture: ParticleMixture) -> Rows:
         """The features of every particle, relative to their average, zero in an empty slot.
 
         Regrouping needs only differences, and values far from zero would lose them to rounding.
@@ -69,7 +70,7 @@ class OnCircles(NamedTuple):
 
     periods: tuple[float, ...]
 
-    def __call__(self, states: PyTree) -> Float[Array, "n k"]:
+    def __call__(self, states: PyTree) -> Rows:
         """The features of each particle."""
         columns, numbers = [], flatten_states(states).T
         if len(numbers) != len(self.periods):
@@ -80,7 +81,7 @@ class OnCircles(NamedTuple):
         return jnp.stack(columns, axis=1)
 
 
-def origin(values: Float[Array, "n k"], mixture: ParticleMixture) -> Float[Array, " k"]:
+def origin(values: Rows, mixture: ParticleMixture) -> Float[Array, " k"]:
     """The average over the filled slots, with equal weights."""
     filled = mixture.occupied[:, None]
     total = jnp.sum(jnp.where(filled, values, 0.0), axis=0)
@@ -104,10 +105,7 @@ def relative_weights(mixture: ParticleMixture) -> Float[Array, " n"]:
 
 
 def weighted_means(
-    features: Float[Array, "n k"],
-    weights: Float[Array, " n"],
-    labels: Int[Array, " n"],
-    num_groups: int,
+    features: Rows, weights: Float[Array, " n"], labels: Int[Array, " n"], num_groups: int
 ) -> tuple[Float[Array, " g"], Float[Array, "g k"]]:
     """The mass and the mean of the particles under each label, zero for an empty one."""
     sums = column_sums(_first_moments(features, weights), labels, num_groups)
@@ -116,10 +114,7 @@ def weighted_means(
 
 
 def summarise(
-    features: Float[Array, "n k"],
-    weights: Float[Array, " n"],
-    labels: Int[Array, " n"],
-    num_groups: int,
+    features: Rows, weights: Float[Array, " n"], labels: Int[Array, " n"], num_groups: int
 ) -> Groups:
     """Weighted mass, mean and covariance of the particles under each label."""
     masses, means = weighted_means(features, weights, labels, num_groups)
@@ -129,10 +124,7 @@ def summarise(
 
 
 def summarise_about(
-    points: Float[Array, "g k"],
-    gaps: Float[Array, "n k"],
-    weights: Float[Array, " n"],
-    labels: Int[Array, " n"],
+    points: Float[Array, "g k"], gaps: Rows, weights: Float[Array, " n"], labels: Int[Array, " n"]
 ) -> Groups:
     """`summarise` in one pass, of particles that are `gaps` away from a point of their group.
 
@@ -154,16 +146,14 @@ def _or_one(masses: Float[Array, " g"]) -> Float[Array, " g"]:
     return jnp.where(masses > 0, masses, 1.0)
 
 
-def _first_moments(
-    features: Float[Array, "n k"], weights: Float[Array, " n"]
-) -> Float[Array, "c n"]:
+def _first_moments(features: Rows, weights: Float[Array, " n"]) -> Float[Array, "c n"]:
     """The weights, and the weighted features, column by column."""
     weights = weights.astype(features.dtype)
     return jnp.stack([weights, *map(partial(jnp.multiply, weights), features.T)])
 
 
 def _products(
-    gaps: Float[Array, "n k"], weights: Float[Array, " n"]
+    gaps: Rows, weights: Float[Array, " n"]
 ) -> tuple[Float[Array, "c n"], Int[np.ndarray, "k k"]]:
     """The weighted products of each pair of features, column by column, and the pairs."""
     num_features = gaps.shape[1]

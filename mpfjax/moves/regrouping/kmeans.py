@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping, Regrouped
-from mpfjax.moves.regrouping.features import ByFeatures
+from mpfjax.moves.regrouping.features import ByFeatures, Rows
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.segments import segment_argmax, segment_counts, segment_sum
 from mpfjax.operations.stored import most_of_runs
@@ -56,9 +56,7 @@ class KMeans(AbstractRegrouping, ByFeatures):
         return labels, mixture.memory
 
 
-def farthest_first(
-    features: Float[Array, "n k"], occupied: Bool[Array, " n"], num_seeds: int
-) -> Int[Array, " n"]:
+def farthest_first(features: Rows, occupied: Bool[Array, " n"], num_seeds: int) -> Int[Array, " n"]:
     """The nearest of so many seeds to each particle.
 
     The first is the particle farthest from the mean, and each other the one farthest from all
@@ -84,7 +82,7 @@ def farthest_first(
 
 
 def nearest(
-    features: Float[Array, "n k"], centroids: Float[Array, "m k"], alive: Bool[Array, " m"]
+    features: Rows, centroids: Float[Array, "m k"], alive: Bool[Array, " m"]
 ) -> Int[Array, " n"]:
     """The living centroid nearest to each particle; of equally near ones, the first.
 
@@ -110,7 +108,7 @@ def nearest(
 
 def _nearer(
     so_far: tuple[Float[Array, " n"], Int[Array, " n"]],
-    features: Float[Array, "n k"],
+    features: Rows,
     centroids: Float[Array, "m k"],
     first: int | Int[Array, ""],
 ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:

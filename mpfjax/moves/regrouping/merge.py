@@ -1,7 +1,5 @@
 """Components that overlap, that are improbable, and that repel each other."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,14 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count, InnerShare, Positive
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping, Regrouped, Step
+from mpfjax.moves.base import (
+    AbstractMove,
+    AbstractPropagation,
+    AbstractRegrouping,
+    Groups,
+    Regrouped,
+    Step,
+)
 from mpfjax.moves.regrouping.features import ByFeatures, relative_weights, separation, summarise
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
@@ -113,7 +118,7 @@ class Prune(AbstractMove):
     """
 
     least_share: InnerShare = eqx.field(static=True, default=1e-6)
-    group: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(static=True, default=None)
+    group: Groups | None = eqx.field(static=True, default=None)
 
     approximate = True
     """the mass of the pruned components is lost."""
@@ -162,9 +167,7 @@ class Exclusion(AbstractPropagation, ByFeatures):
 
     strength: Positive = eqx.field(static=True, kw_only=True)
     radius: Positive = eqx.field(static=True, kw_only=True)
-    group: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(
-        static=True, default=None, kw_only=True
-    )
+    group: Groups | None = eqx.field(static=True, default=None, kw_only=True)
 
     approximate = True
     """components interact in a way that the model does not have."""

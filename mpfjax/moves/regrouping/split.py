@@ -12,6 +12,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping, Regrouped
 from mpfjax.moves.regrouping.features import (
     ByFeatures,
+    Rows,
     relative_weights,
     separation,
     summarise_about,
@@ -76,7 +77,7 @@ class Split(AbstractRegrouping, ByFeatures):
         return self._halves(mixture, self.features_of(mixture))[-1]
 
     def _halves(
-        self, mixture: ParticleMixture, features: Float[Array, "n k"]
+        self, mixture: ParticleMixture, features: Rows
     ) -> tuple[Int[Array, " n"], Int[Array, " m"], Float[Array, " m"], Bool[Array, " m"]]:
         """Each component cut in two: the half that each particle is in; and of each component the
         lighter half, how many deviations they are apart, and whether that is enough.
@@ -160,7 +161,7 @@ def free_labels(
 
 
 def _nearer(
-    features: Float[Array, "n k"], centres: Float[Array, "g k"], parent: Int[Array, " n"]
+    features: Rows, centres: Float[Array, "g k"], parent: Int[Array, " n"]
 ) -> tuple[Int[Array, " n"], Float[Array, "n k"]]:
     """Which of its own component's two centres each particle is nearer to, and how far from it."""
     m = centres.shape[0] // 2

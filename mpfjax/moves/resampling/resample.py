@@ -1,18 +1,17 @@
 """Resampling within components: systematic, stratified or multinomial."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Key, PyTree
+from jaxtyping import Array, Bool, Int, Key
 
 from mpfjax.checks import Count, Share, one_of
 from mpfjax.memory import Offspring, after_resampling, reference_slot
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractResampling, Gradient, Step
+from mpfjax.moves.base import AbstractResampling, Gradient, Groups, Step
 from mpfjax.moves.resampling.allocation import (
     allocate_slots,
     demands_by_variance,
@@ -81,9 +80,7 @@ class Resample(AbstractResampling):
     along_curve: bool = eqx.field(static=True, default=False, kw_only=True)
     gradient: Gradient = eqx.field(static=True, default="none", kw_only=True)
     allocation: Allocation = eqx.field(static=True, default="variance", kw_only=True)
-    group: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(
-        static=True, default=None, kw_only=True
-    )
+    group: Groups | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self) -> None:
         if self.group is not None and self.particles_per_component is not None:
