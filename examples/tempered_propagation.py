@@ -55,7 +55,7 @@ class PropagateTempered(AbstractPropagation, AbstractWrapper):
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t, stage by stage."""
         if now.is_missing:
-            return predict(key, now.model, mixture, "none")
+            return predict(key, now.law, mixture, "none", "independent")
         key_noise, *keys = jax.random.split(key, 1 + len(self.exponents))
         before, parents = mixture, mixture.particles
         noise = jax.random.normal(key_noise, (mixture.num_particles, now.model.noise_dimension))

@@ -16,7 +16,7 @@ from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.models.noise import Noise
 from mpfjax.models.targets import TargetsModel
-from mpfjax.moves.base import AbstractMove, AbstractProposal, AbstractResampling, Gradient, as_moves
+from mpfjax.moves.base import AbstractMove, AbstractProposal, Gradient, as_moves
 from mpfjax.moves.every import Every
 from mpfjax.moves.objects.bernoulli import Associate
 from mpfjax.moves.objects.clusters import PropagateInClusters
@@ -38,6 +38,7 @@ from mpfjax.transforms import (
 )
 
 Importance = Literal["propagated", "predictive_gaussian"]
+_PER_BIRTH, _UNDETECTED = 50, 400  # particles of an object, and of those not detected yet
 # K-means starts from the components of a few steps before, and needs few iterations.
 _WARM_ITERATIONS, _ITERATIONS = 2, 5
 
@@ -278,28 +279,26 @@ def bernoulli_filter(
     max_targets: Count,
     *,
     proposal: AbstractProposal | None = None,
-    particles_per_birth: Count = 50,
-    undetected_particles: Count = 400,
-    resample: AbstractResampling | None = None,
 ) -> Filter:
     """An unknown number of objects that appear and disappear: predict, associate.
 
     A particle implementation of the Poisson multi-Bernoulli filter (Williams 2015): each of
     `max_targets` components is a potential object with its own existence probability, and one more
     component represents the intensity of undetected objects. `estimate_targets` summarises the
-    objects. `Associate` describes the algorithm and the last three arguments.
+    objects. `Associate` describes the algorithm: 50 particles for a new object, and 400 for
+    undetected ones.
 
-    - `num_particles`: in total: `undetected_particles`, and a hundred or more per object.
+    - `num_particles`: in total: those of undetected objects, and a hundred or more per object.
     - `max_targets`: more than the number of measurements per scan if objects may appear anywhere.
 
-    By default each object is redrawn from its Gaussian, for which a few particles are sufficient.
-    With `Resample()` its distribution may have any shape, but then all its particles descend from
-    its first `particles_per_birth` particles, which must be numerous. Use the filter with a
-    `TargetsModel` if neither the number of objects nor the origin of the measurements is known. For
-    a single object use a filter with `ClutteredModel`, for boxes in a video `vision.ObjectTracker`.
+    Each object is redrawn from its Gaussian, for which a few particles are sufficient. If
+    `map_moves` changes the `resample` of `Associate` to `Resample()`, its distribution may have any
+    shape, but then all its particles descend from its first ones, which must be numerous. Use the
+    filter with a `TargetsModel` if neither the number of objects nor the origin of the measurements
+    is known. For a single object use a filter with `ClutteredModel`, for boxes in a video
+    `vision.ObjectTracker`.
     """
-    resample = RegenerateObjects() if resample is None else resample
-    associate = Associate(particles_per_birth, undetected_particles, resample)
+    associate = Associate(_PER_BIRTH, _UNDETECTED, RegenerateObjects())
     return Filter(model, [Predict(proposal), associate], num_particles, max_targets + 1)
 
 

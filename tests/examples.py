@@ -10,7 +10,7 @@ from mpfjax.mixture import single_component
 
 NUM_PARTICLES = 40
 NUM_COMPONENTS = 6
-AT_START = mpfjax.Step(None, is_initial=True)  # where every move runs, whatever the model
+AT_START = mpfjax.Step(None, None, is_initial=True)  # where every move runs, whatever the model
 
 
 def make_mixture(states, log_weights, labels, num_components, memory=None) -> ParticleMixture:

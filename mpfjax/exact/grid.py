@@ -45,17 +45,11 @@ class GridFilterRun(eqx.Module):
         return self.probabilities @ jnp.clip((self.grid - threshold) / cell + 0.5, 0.0, 1.0)
 
 
-def grid_filter(
-    model: Any,
-    observations: PyTree,
-    grid: Float[Array, " g"],
-    *,
-    state_shape: tuple[int, ...] = (),
-) -> GridFilterRun:
+def grid_filter(model: Any, observations: PyTree, grid: Float[Array, " g"]) -> GridFilterRun:
     """The recursion of Vermaak et al. (2003), eqs. 1 and 2, by quadrature on an even grid.
 
-    - `model`: has `log_initial`, `log_transition` and `log_likelihood`; its states are scalars of
-      shape `state_shape`, () or (1,).
+    - `model`: has `log_initial`, `log_transition` and `log_likelihood`; its states are scalars, or
+      vectors of one number.
     - `grid`: evenly spaced points that cover all possible values of x_t, with several points per
       smallest standard deviation of the model. The error then decreases faster than any power of
       the spacing.
@@ -71,7 +65,7 @@ def grid_filter(
         require(model, density, "grid_filter")
     refuse_marginalised(model, "grid_filter", "switching_filter takes one with regimes")
     series = as_series(observations, model)
-    return _grid_filter(model, series, points, width, state_shape)
+    return _grid_filter(model, series, points, width)
 
 
 def _width(grid: Any) -> Any:
@@ -95,15 +89,16 @@ def _checked_grid(grid: Any) -> tuple[Float[Array, " g"], Any]:
 
 
 @eqx.filter_jit
-def _grid_filter(model, series, grid, width, state_shape):
+def _grid_filter(model, series, grid, width):
     num_points = grid.shape[0]
-    states = grid.reshape(-1, *state_shape)
+    one = jax.eval_shape(lambda key: model.sample_initial(key, 1), jax.random.key(0))
+    states = grid.reshape(-1, *one.shape[1:])
     log_prior = model.log_initial(states)
     cell = jnp.asarray(width, grid.dtype)
 
     def kernel_of(model: Any) -> Float[Array, "g g"]:
         def row(previous: Float[Array, "..."]) -> Float[Array, " g"]:
-            copies = jnp.broadcast_to(previous, (num_points, *state_shape))
+            copies = jnp.broadcast_to(previous, states.shape)
             values = model.log_transition(states, copies)
             return real_each(values, num_points, model, "log_transition")
 

@@ -94,7 +94,7 @@ def learn_lookahead(
     return _twisted(filter, twist, filter.num_particles)
 
 
-def _knowing_nothing(key: Key[Array, ""], filter: Filter, length: int, features: Any) -> Twist:
+def _knowing_nothing(key: Key[Array, ""], filter: Any, length: int, features: Any) -> Twist:
     """ψ = 1 at every step."""
     model, size = filter.model, filter.num_components
     of_states = over_particles(model, features) or flatten_states

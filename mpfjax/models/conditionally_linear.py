@@ -160,7 +160,8 @@ class MarginalisedLaw(Law):
 class MixedLaw(MarginalisedLaw):
     """The law of a conditionally linear model whose z_t depends on x_{t-1}; z_t is then normal."""
 
-    has_density = is_of_noise = True
+    has_density = True
+    is_of_noise = property(lambda self: True)
 
     def draw(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """z_t, drawn from its normal law."""

@@ -26,7 +26,7 @@ class Step(eqx.Module):
 
     model: Any
     """the filter's own model, an `AbstractStateSpaceModel` at u_t."""
-    observation: PyTree = None
+    observation: PyTree
     """y_t; None where it is missing, and most moves then do nothing."""
     inputs: PyTree = None
     """u_t, the known inputs of the step, from which the model at u_t was made."""

@@ -184,7 +184,7 @@ def segment_argmax(
     values = jax.lax.stop_gradient(values)  # an index has no derivative
     limits = jnp.finfo(values.dtype)
     values = jnp.clip(values, limits.min, limits.max)
-    largest = segment_reduce("max", values, segments, num_segments, limits.min)
+    largest = segment_reduce("max", values, segments, num_segments, float(limits.min))
     is_largest = values >= spread(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     if not are_masked(n, num_segments):

@@ -183,7 +183,7 @@ def test_grid_filter_agrees_with_the_kalman_filter(parts, seen, ends):
     model, grid = mpfjax.LinearGaussianModel(**parts), jnp.linspace(*ends, 1601)
     data = Series.skipping(jnp.asarray(seen, jnp.float32)[:, None])
     (m0,) = parts["m0"]
-    run = grid_filter(model, data, grid, state_shape=(1,))
+    run = grid_filter(model, data, grid)
     exact = kalman_filter(model, data)
     mean, variance = np.asarray(exact.means[:, 0]), np.asarray(exact.covariances[:, 0, 0])
     is_far = m0 == 300

@@ -50,7 +50,7 @@ def test_regrouping_changes_nothing_but_indicators_and_memory(name):
     """And leaves a mixture whose summaries are finite."""
     move = REGROUPINGS[name]
     for example, mixture in MIXTURES[6].items():
-        mixture = mixture.replace(memory=move.initial_memory(Step(MODEL), 6))
+        mixture = mixture.replace(memory=move.initial_memory(Step(MODEL, None), 6))
         moved = moved_by(move, jax.random.key(0), mixture)
         for field in ("particles", "log_weights", "ancestor_indices"):
             np.testing.assert_array_equal(getattr(moved, field), getattr(mixture, field))

@@ -58,7 +58,7 @@ def test_a_label_that_dies_within_and_is_used_again_has_no_past():
     mixture = make_mixture(states, np.zeros(30), np.repeat(np.arange(3), 10), 3)
     every = Every(1, [Merge(None, max_distance=1.0, patience=2), Split(1.0)])
     durations = jnp.array([[5, 5, 0], [5, 5, 0], [0, 0, 5]], jnp.int32)
-    memory = every.initial_memory(mpfjax.Step(MODEL), 3) | {"overlap_durations": durations}
+    memory = every.initial_memory(mpfjax.Step(MODEL, None), 3) | {"overlap_durations": durations}
     after = every(KEYS[0], mixture.replace(memory=memory), AT_START)
     np.testing.assert_array_equal(np.unique(after.component_indicators), [0, 1, 2])
     assert after.memory["overlap_durations"][0, 1] == 0
@@ -86,7 +86,7 @@ def test_a_move_that_holds_moves_forwards_all_that_they_are():
         assert getattr(move, name), name
     for name in ("keeps_parents", "keeps_families", "weighs"):
         assert not getattr(move, name), name
-    assert "odd" in move.initial_memory(mpfjax.Step(MODEL), 3)
+    assert "odd" in move.initial_memory(mpfjax.Step(MODEL, None), 3)
     now = mpfjax.Step(MODEL, jnp.float32(1.0))
     with pytest.raises(ValueError, match="odd"):
         move.check(now, 4, 3)
@@ -107,6 +107,6 @@ def test_particles_in_order_come_through():
     """Both branches have one form, whatever moved the particles before."""
     mixture = single_component(jnp.arange(6.0), 2).at_step().with_order(True)
     filter = mpfjax.Filter(MODEL, [Propagate(), Every(2, [RandomLabels()])], 6, 2)
-    memory = filter.moves[1].initial_memory(mpfjax.Step(MODEL), 2)
+    memory = filter.moves[1].initial_memory(mpfjax.Step(MODEL, None), 2)
     moved = filter.moves[1](KEYS[0], mixture.replace(memory=memory), AT_START)
     np.testing.assert_array_equal(moved.particles, mixture.particles)

@@ -238,7 +238,7 @@ def test_no_child_is_kept_twice_and_every_component_keeps_its_mass(name):
     keys = jax.random.split(KEY, 400)
     start = start.replace(ancestor_indices=jnp.arange(NUM_PARTICLES, dtype=jnp.int32))
     seen = jax.jit(jax.vmap(lambda key: move(key, start, Step(MODEL, OBSERVATIONS[3]))))(keys)
-    unseen = jax.jit(jax.vmap(lambda key: move(key, start, Step(MODEL))))(keys)
+    unseen = jax.jit(jax.vmap(lambda key: move(key, start, Step(MODEL, None))))(keys)
     for after in jax.tree.map(np.asarray, (seen, unseen)):
         child = after.ancestor_indices * NUM_REGIMES + after.particles.latent
         filled = after.log_weights > -np.inf

@@ -124,7 +124,7 @@ class TestMerge:
     def test_patience_counts_steps_in_a_row(self):
         near, far = clouds([[0.0], [0.1]], [30, 30]), clouds([[0.0], [50.0]], [30, 30])
         merge = Merge(2.0, patience=3)
-        memory = merge.initial_memory(mpfjax.Step(MODEL), 6)
+        memory = merge.initial_memory(mpfjax.Step(MODEL, None), 6)
         merged = []
         for mixture in (near, near, far, near, near, near, near):
             moved = eqx.filter_jit(merge)(KEY, mixture.replace(memory=memory))
@@ -278,7 +278,7 @@ def test_only_what_is_below_the_share_of_the_heaviest_is_pruned(masses):
     kept = lives[np.asarray(before.component_indicators)]
     np.testing.assert_array_equal(after.log_weights[kept], before.log_weights[kept])
     assert Prune().approximate
-    assert Prune(1e-3)(KEY, before, mpfjax.Step(MODEL)) is before
+    assert Prune(1e-3)(KEY, before, mpfjax.Step(MODEL, None)) is before
 
 
 def second(states):
