@@ -9,11 +9,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.arrays import (
-    real_array,
-)
+from mpfjax.arrays import real_array
 from mpfjax.checks import shown
-from mpfjax.models.base import real_each, require, with_inputs
+from mpfjax.models.base import require, with_inputs
 from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.models.series import Series, as_series
 from mpfjax.operations.logarithms import log_or_nothing, log_sum_exp, softmax
@@ -90,17 +88,15 @@ def _checked_grid(grid: Any) -> tuple[Float[Array, " g"], Any]:
 
 @eqx.filter_jit
 def _grid_filter(model, series, grid, width):
-    num_points = grid.shape[0]
     one = jax.eval_shape(lambda key: model.sample_initial(key, 1), jax.random.key(0))
     states = grid.reshape(-1, *one.shape[1:])
-    log_prior = model.log_initial(states)
+    log_prior = law_of(model).log_initial(states)
     cell = jnp.asarray(width, grid.dtype)
 
     def kernel_of(model: Any) -> Float[Array, "g g"]:
         def row(previous: Float[Array, "..."]) -> Float[Array, " g"]:
             copies = jnp.broadcast_to(previous, states.shape)
-            values = model.log_transition(states, copies)
-            return real_each(values, num_points, model, "log_transition")
+            return law_of(model).log_transition(states, copies)
 
         return cell * jnp.exp(jax.vmap(row)(states))
 

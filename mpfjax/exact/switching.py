@@ -73,19 +73,13 @@ def _enumerate_sequences(
     log_evidence = jax.vmap(log_sum_exp)(log_weights.T)
     weights = jnp.exp(log_weights - log_evidence[None])
     is_regime = jax.nn.one_hot(sequences, k, dtype=weights.dtype)
-    means, covariances = _mixture_moments(weights, *of_filter)
+    filtering = jnp.einsum("st,stk->tk", weights, is_regime[:, 1:])
     final = jnp.broadcast_to(weights[:, -1:], (len(places), length + 1))
-    smoothed_means, smoothed_covariances = _mixture_moments(final, *of_smoother)
+    smoothing = jnp.einsum("st,stk->tk", final, is_regime)
+    moments = _mixture_moments(weights, *of_filter), _mixture_moments(final, *of_smoother)
     increments = jnp.diff(log_evidence, prepend=jnp.zeros(1, log_evidence.dtype))
     return SwitchingFilterRun(
-        regime_probabilities=jnp.einsum("st,stk->tk", weights, is_regime[:, 1:]),
-        means=means,
-        covariances=covariances,
-        smoothed_regime_probabilities=jnp.einsum("st,stk->tk", final, is_regime),
-        smoothed_means=smoothed_means,
-        smoothed_covariances=smoothed_covariances,
-        log_likelihood_increments=increments,
-        log_marginal_likelihood=log_evidence[-1],
+        filtering, *moments[0], smoothing, *moments[1], increments, log_evidence[-1]
     )
 
 

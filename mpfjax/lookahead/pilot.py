@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require_noise
-from mpfjax.models.law import law_of, refuse_marginalised
+from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.moves.base import AbstractProposal, Given, Step
 from mpfjax.moves.initial import selection_weights
@@ -51,14 +51,11 @@ class PilotLookahead(AbstractLookahead):
 
     def log_factors(self, mixture: ParticleMixture, now: Step) -> Float[Array, " n"]:
         """log ν of each particle, by the weights of the mixture."""
-        model = now.model
-        states = mixture.particles
-        ones = jnp.ones((mixture.num_particles, model.noise_dimension), noise_dtype(states))
+        law, states = now.law, mixture.particles
+        shape = (mixture.num_particles, law.noise_dimension(states))
+        ones = jnp.ones(shape, noise_dtype(states))
         looks = [
-            law_of(model).log_likelihood(
-                now.observation, model.transition_from_noise(noise, states)
-            )
-            for noise in (ones, -ones)
+            law.log_likelihood(now.observation, law.make(noise, states)) for noise in (ones, -ones)
         ]
         # Any ν is exact, so that its derivative is not needed.
         return jax.lax.stop_gradient(jnp.log(selection_weights(jnp.stack(looks), mixture.weights)))

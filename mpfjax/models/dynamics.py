@@ -68,8 +68,7 @@ class AbstractDynamics(Fitting):
 
     def sample(self, key: Key[Array, ""], current: Rows, previous: Rows | None = None) -> Rows:
         """x_t given x_{t-1}, and x_{t-2} where the order is 2."""
-        steps = self.sample_step(key, current.shape[0], current.dtype)
-        return self.expected(current, previous) + steps
+        return self.expected(current, previous) + self.sample_step(key, len(current), current.dtype)
 
     def log_density(
         self, following: Rows, current: Rows, previous: Rows | None = None

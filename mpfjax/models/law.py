@@ -53,15 +53,13 @@ class Law:
         """x_0 with this random part."""
         return draws
 
-    def sample_initial(
-        self, key: Key[Array, ""], number: int, noise: str = "independent"
-    ) -> PyTree:
+    def sample_initial(self, key: Key[Array, ""], size: int, noise: str = "independent") -> PyTree:
         """x_0 of so many particles, made of this noise if the model has `initial_from_noise`."""
         if noise == "independent" or not is_made_of_noise(self.model, "initial"):
-            draws = self.model.sample_initial(key, number)
-            check_states(draws, self.model, "sample_initial", number)
+            draws = self.model.sample_initial(key, size)
+            check_states(draws, self.model, "sample_initial", size)
             return self.start(draws)
-        shape = (number, self.model.initial_noise_dimension)
+        shape = (size, self.model.initial_noise_dimension)
         return self.make_initial(draw_noise(key, noise, shape, default_float()))
 
     def make_initial(self, noise: Float[Array, "n k"]) -> PyTree:

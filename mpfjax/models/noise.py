@@ -63,9 +63,8 @@ def draw_noise(
         points = ranks[:, None] * _multipliers(d)[None] + bits(key_first, (d,))[None]
         return normal_of(points, dtype)
     ranks = jnp.arange(n, dtype=jnp.int32)
-    number = 1 if components is None else num_components
-    shifts = stored(bits(key_second, (number, d)) >> _UNUSED)
-    if components is None or number == 1:
+    shifts = stored(bits(key_second, (num_components, d)) >> _UNUSED)
+    if components is None or num_components == 1:
         shifts = shifts.T << _UNUSED
     else:
         ranks = stored(ranks - spread(first_places(components, num_components), components))

@@ -14,12 +14,12 @@ from mpfjax.checks import Count, array_of_numbers, check, check_shape, checked, 
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     asking,
-    check_moved,
     check_states,
     innermost,
     require,
     with_inputs,
 )
+from mpfjax.models.law import Law
 from mpfjax.models.observations import (
     NOT_FINITE,
     USABLE,
@@ -241,8 +241,7 @@ def simulate(
 @jit_on_wide_vectors
 def _simulate(key, model, num_steps, inputs):
     key_initial, key_steps = jax.random.split(key)
-    initial = model.sample_initial(key_initial, 1)
-    check_states(initial, model, "sample_initial", 1)
+    initial = Law(model).sample_initial(key_initial, 1)
     states, observations = steps_ahead(key_steps, model, initial, num_steps, inputs)
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), initial, states), observations
 
@@ -256,9 +255,7 @@ def steps_ahead(
         step_key, now = step
         key_state, key_observation = jax.random.split(step_key)
         at_step = with_inputs(model, now)
-        with asking(at_step, "sample_transition"):
-            moved = at_step.sample_transition(key_state, state)
-        check_moved(moved, state, model)
+        moved = Law(at_step).draw(key_state, state)
         with asking(at_step, "sample_observation"):
             observation = at_step.sample_observation(key_observation, moved)
         check_states(observation, model, "sample_observation", 1)

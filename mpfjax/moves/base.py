@@ -127,24 +127,22 @@ class AbstractMove(Given):
     @property
     def inner(self) -> "Moves":
         """The moves that this move runs."""
-        moves: Moves = ()
-        for name in self.holds:
-            part = getattr(self, name)
-            moves += part if isinstance(part, tuple) else (part,)
-        return moves
+        parts = [getattr(self, name) for name in self.holds]
+        return tuple(jax.tree.leaves(parts, is_leaf=_is_move))
 
     def map_inner(self, change: Callable[[Any], Any]) -> Any:
         """The move in which `change(move)` replaces each move that it runs."""
         if not self.holds:
             return self
-        parts = {}
-        for name in self.holds:
-            part = getattr(self, name)
-            parts[name] = tuple(map(change, part)) if isinstance(part, tuple) else change(part)
-        return dataclasses.replace(self, **parts)
+        parts = {name: getattr(self, name) for name in self.holds}
+        return dataclasses.replace(self, **jax.tree.map(change, parts, is_leaf=_is_move))
 
 
 Moves = tuple[AbstractMove, ...]
+
+
+def _is_move(node: Any) -> bool:
+    return isinstance(node, AbstractMove)
 
 
 class FunctionMove(AbstractMove):

@@ -89,33 +89,28 @@ def require_propagation(now: Step, what: str) -> None:
 
 
 def select(
-    key: Key[Array, ""],
-    states: PyTree,
-    log_factors: Float[Array, "2 k"],
-    number: int,
-    in_order: bool,
+    key: Key[Array, ""], states: PyTree, log_factors: Float[Array, "2 k"], size: int, in_order: bool
 ) -> ParticleMixture:
     """Of many draws a few, kept with probabilities in proportion to ν and weighing 1 / ν.
 
     The logarithm of their mass, of which 1 is the mean, is the mixture's `log_scale`.
     """
-    trust = stored(
-        jax.lax.stop_gradient(selection_weights(log_factors, jnp.ones_like(log_factors[0])))
-    )
+    trust = selection_weights(log_factors, jnp.ones_like(log_factors[0]))
+    trust = stored(jax.lax.stop_gradient(trust))
     pool = single_component(states)
     order = sorted_order(pool, pool.component_indicators) if in_order else None
     weights = whole(trust if order is None else take(trust, order), 0.0)
     totals = jnp.sum(weights, keepdims=True)
     zero = jnp.zeros_like(totals)
     line = Line(pool.num_particles, weights, totals, zero, weights > 0, order, labels=None)
-    targets = jnp.full(1, number, jnp.int32)
-    indices = draw_ancestors(key, line, targets, "systematic", num_slots=number).particles
+    targets = jnp.full(1, size, jnp.int32)
+    indices = draw_ancestors(key, line, targets, "systematic", num_slots=size).particles
     # No ν is below a quarter, so that their inverses need no logarithms to be summed.
     trust = take(trust, indices).astype(default_float())
     total = jnp.sum(1 / trust)
     particles = jax.tree.map(lambda leaf: take(leaf, indices), states)
     return single_component(particles).replace(
-        log_weights=-jnp.log(trust * total), log_scale=jnp.log(total / number)
+        log_weights=-jnp.log(trust * total), log_scale=jnp.log(total / size)
     )
 
 

@@ -123,12 +123,6 @@ class Positions(NamedTuple):
         """In units of 2^-num_bits slots, rounded down."""
         return (self.whole << num_bits) + (self.fraction * 2.0**num_bits).astype(jnp.int32)
 
-    @classmethod
-    def of_units(cls, units: Int[Array, "*shape"], num_bits: int, dtype: jnp.dtype) -> "Positions":
-        """Of whole numbers of units of 2^-num_bits slots."""
-        fraction = (units & ((1 << num_bits) - 1)).astype(dtype) * 2.0**-num_bits
-        return cls(units >> num_bits, fraction)
-
 
 def needs_units(num_values: int, dtype: jnp.dtype) -> bool:
     """Whether sums of this many values of this type have no bits left for the fraction."""

@@ -40,22 +40,20 @@ _REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, 
 
 
 @jax.jit
-def spread(
-    values: Shaped[Array, "m *rest"], segments: Int[Array, " n"]
-) -> Shaped[Array, "n *rest"]:
-    """values[segments], each entry its segment's value; a label out of range gets some value.
+def spread(values: Shaped[Array, "m *rest"], labels: Int[Array, " n"]) -> Shaped[Array, "n *rest"]:
+    """values[labels], each entry its segment's value; a label out of range gets some value.
 
     With up to 16 segments it is a choice between them, with more a gather of values that are stored
     for it: on a CPU, nothing that is fused with a gather runs on vectors.
     """
     num_segments = values.shape[0]
     if num_segments > FEW_CHOICES:
-        return take(stored(values), segments)
-    shape = (*segments.shape, *values.shape[1:])
+        return take(stored(values), labels)
+    shape = (*labels.shape, *values.shape[1:])
     if num_segments == 1:
         return jnp.broadcast_to(values, shape)
     cases = map(partial(jnp.broadcast_to, shape=shape), jnp.split(values, num_segments))
-    which = jax.lax.broadcast_in_dim(segments.astype(jnp.int32), shape, (0,))
+    which = jax.lax.broadcast_in_dim(labels.astype(jnp.int32), shape, (0,))
     return jax.lax.select_n(which, *cases)
 
 
@@ -96,37 +94,12 @@ def segment_reduce(
 
     Of these the sum has a derivative.
     """
-    if not are_masked(len(values), num_segments):
-        if how != "add":
-            return _scatter(how, values, segments, num_segments, nothing)
-        sums = _scatter(how, stored(values), segments, num_segments, 0)
-        # The form of JAX itself, whose derivative can be transposed.
-        return add_gradient(sums, jax.ops.segment_sum(values, segments, num_segments))
-    # XLA fuses the masks into the sum and never stores them.
-    is_member = segments[None] == jnp.arange(num_segments, dtype=segments.dtype)[:, None]
-    of_each = jnp.where(is_member, values[None], nothing)
-    return _REDUCTIONS[how](of_each.astype(values.dtype), axis=1)
-
-
-@partial(jax.jit, static_argnames="num_segments")
-def segment_counts(
-    mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
-) -> Int[Array, " num_segments"]:
-    """How many of the masked entries lie in each segment."""
-    if mask.shape[0] >= EXACT_IN_FLOAT32:
-        return _scatter("add", mask.astype(jnp.int32), segments, num_segments, 0)
-    return segment_sum(mask.astype(default_float()), segments, num_segments).astype(jnp.int32)
-
-
-def _scatter(
-    how: str,
-    values: Shaped[Array, " n"],
-    segments: Int[Array, " n"],
-    num_segments: int,
-    initial: float,
-) -> Shaped[Array, " num_segments"]:
-    """The sum of each segment's values, or their "max" or "min", starting from `initial`."""
-    n = values.shape[0]
+    n, reduce = values.shape[0], _REDUCTIONS[how]
+    if are_masked(n, num_segments):
+        # XLA fuses the masks into the sum and never stores them.
+        is_member = segments[None] == jnp.arange(num_segments, dtype=segments.dtype)[:, None]
+        of_each = jnp.where(is_member, values[None], nothing)
+        return reduce(of_each.astype(values.dtype), axis=1)
     # A power of two: enough that the rounding error of each lane's sum stays small.
     num_lanes = max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
     padding = (0, -n % num_lanes)
@@ -136,11 +109,26 @@ def _scatter(
     # The lane is added without other arithmetic. XLA would move such arithmetic out of a filter's
     # loop, and not see any more that two sums by the same labels use the same places.
     places = labels * num_lanes + jax.lax.broadcasted_iota(jnp.int32, labels.shape, 1)
-    line = jnp.full((num_segments + 1) * num_lanes, initial, values.dtype)
+    line = jnp.full((num_segments + 1) * num_lanes, nothing, values.dtype)
     combine = getattr(line.at[places.reshape(-1).astype(jnp.uint32)], how)
-    lines = combine(jnp.pad(jax.lax.stop_gradient(values), padding), mode="promise_in_bounds")
+    terms = jax.lax.stop_gradient(stored(values) if how == "add" else values)
+    lines = combine(jnp.pad(terms, padding), mode="promise_in_bounds")
     lines = lines.reshape(-1, num_lanes)[:num_segments]
-    return _REDUCTIONS[how](lines, axis=1).astype(values.dtype)
+    reduced = reduce(lines, axis=1).astype(values.dtype)
+    if how != "add":
+        return reduced
+    # The form of JAX itself, whose derivative can be transposed.
+    return add_gradient(reduced, jax.ops.segment_sum(values, segments, num_segments))
+
+
+@partial(jax.jit, static_argnames="num_segments")
+def segment_counts(
+    mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Int[Array, " num_segments"]:
+    """How many of the masked entries lie in each segment."""
+    if mask.shape[0] >= EXACT_IN_FLOAT32:
+        return segment_reduce("add", mask.astype(jnp.int32), segments, num_segments)
+    return segment_sum(mask.astype(default_float()), segments, num_segments).astype(jnp.int32)
 
 
 def segment_log_sum_exp(

@@ -97,11 +97,10 @@ def draw_rows(
     keys: Key[Array, " objects"], log_weights: Float[Array, "objects n"]
 ) -> tuple[Int[Array, "objects n"], Float[Array, " objects"]]:
     """The rows that each object is resampled from, and log of its mean weight."""
-    resample = Resample()
 
     def draw(key: Key[Array, ""], log_weights: Float[Array, " n"]) -> tuple:
         cloud = single_component(log_weights).reweight(log_weights)
-        return resample.resample(key, cloud).ancestor_indices, cloud.log_mass
+        return Resample().resample(key, cloud).ancestor_indices, cloud.log_mass
 
     return jax.vmap(draw)(keys, log_weights)
 

@@ -197,8 +197,8 @@ class GaussNewtonProposal(_GaussianProposal):
         prior, state_shape = model.transition_mean(previous_states), previous_states.shape[1:]
         prior = prior.reshape(len(prior), -1)
         target = jnp.atleast_1d(now.observation).astype(prior.dtype)
-        prior_precision = _inverse(_matrix(model.transition_covariance)).astype(prior.dtype)
-        precision_y = _inverse(_matrix(model.observation_covariance)).astype(prior.dtype)
+        prior_precision = _inverse(jnp.atleast_2d(model.transition_covariance)).astype(prior.dtype)
+        precision_y = _inverse(jnp.atleast_2d(model.observation_covariance)).astype(prior.dtype)
 
         def observe(state: Float[Array, " d"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
             value = model.observation_mean(state.reshape(1, *state_shape)).reshape(-1)
@@ -228,10 +228,6 @@ def _solve_transposed(
     """F⁻ᵀ v, by backward substitution: mirrored, the upper triangle is a lower one."""
     mirrored = jnp.swapaxes(factors, 1, 2)[:, ::-1, ::-1]
     return solve_lower(mirrored, vectors[:, ::-1])[:, ::-1]
-
-
-def _matrix(covariance: Float[Array, "..."]) -> Float[Array, "d d"]:
-    return covariance.reshape(1, 1) if jnp.ndim(covariance) == 0 else jnp.asarray(covariance)
 
 
 def _inverse(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:

@@ -124,7 +124,8 @@ class Line(NamedTuple):
             within = before - self.of_places(take(before, self.extents(drawn=False)[0]))
             within = jnp.minimum(within, self.of_places(lengths << num_bits))
             places = within + self.of_places(first_slots << num_bits)
-            return Positions.of_units(places, num_bits, dtype), before < upto[-1]
+            fraction = (places & ((1 << num_bits) - 1)).astype(dtype) * 2.0**-num_bits
+            return Positions(places >> num_bits, fraction), before < upto[-1]
         before, total = sum_before(values)
         whole_parts = jnp.floor(before)
         positions = Positions(whole_parts.astype(jnp.int32), before - whole_parts)
@@ -157,18 +158,16 @@ def in_line(mixture: ParticleMixture, stays: Bool[Array, " n"] | None, along_cur
         # Labels without particles come last.
         return order, jnp.where(in_turn < m, take(log_weights, order), -jnp.inf), in_turn
 
-    def by_component() -> tuple[Array, Array, Array]:
-        return in_order(order_by_segment(labels, m))
-
-    def as_they_are() -> tuple[Array, Array, Array]:
-        return jnp.arange(labels.shape[0], dtype=jnp.int32), log_weights, labels
-
     if along_curve:
         order = sorted_order(mixture, labels[:n])
         order, log_weights, labels = in_order(whole(order, labels.shape[0] - 1))
     else:
         is_mixed = jnp.any(labels[1:] < labels[:-1])
-        order, log_weights, labels = cond_if_any(is_mixed, by_component, as_they_are)
+        order, log_weights, labels = cond_if_any(
+            is_mixed,
+            lambda: in_order(order_by_segment(labels, m)),
+            lambda: (jnp.arange(labels.shape[0], dtype=jnp.int32), log_weights, labels),
+        )
     log_largest = finite_or_zero(segment_reduce("max", log_weights, labels, m, -jnp.inf))
     relative = exp(log_weights - spread(log_largest, jnp.minimum(labels, m - 1)))
     is_drawn = relative > 0
