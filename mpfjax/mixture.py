@@ -386,8 +386,7 @@ class ParticleMixture(eqx.Module):
         indices = jnp.arange(self.num_particles, dtype=jnp.int32)
         if num_islands() > 1:
             indices += self.num_particles * island_index()
-        no_growth = jnp.zeros((), self.log_weights.dtype)
-        within = Within(jnp.zeros(self.num_components, bool), no_growth)
+        within = Within(jnp.zeros(self.num_components, bool), jnp.zeros((), self.log_weights.dtype))
         return self.replace(ancestor_indices=indices, t=self.t + 1, within=within, periods=None)
 
     @property

@@ -205,9 +205,8 @@ def with_alarm(filter: Filter) -> Filter:
 def _with_restart(filter: Filter, **settings: Any) -> Filter:
     """The filter whose `Restart`, after the last move that changes weights, has these settings."""
     if not any(isinstance(move, Restart) for move in filter.moves):
-        place = 1 + max(
-            (t for t, move in enumerate(filter.moves) if not move.keeps_mass), default=-1
-        )
+        places = [t for t, move in enumerate(filter.moves) if not move.keeps_mass]
+        place = 1 + max(places, default=-1)
         restart = Restart(0, at_start=False, probability=None, has_alarm=False)
         filter = filter.replace(moves=[*filter.moves[:place], restart, *filter.moves[place:]])
     return _change(filter, Restart, lambda move: dataclasses.replace(move, **settings))

@@ -109,12 +109,9 @@ def _grid_filter(model, series, grid, width):
         kernel = kernel_of(model_now) if shared is None else shared
         predicted = jnp.matmul(probabilities, kernel, precision="highest")
         log_factors = law_of(model_now).log_likelihood(now.observations, states)
-        if now.present is not None:
-            log_factors = jnp.where(now.present, log_factors, 0.0)
-        log_joint = log_or_nothing(predicted) + log_factors
-        increment = log_sum_exp(log_joint)
-        if now.present is not None:
-            increment = jnp.where(now.present, increment, 0.0)
+        is_present = True if now.present is None else now.present
+        log_joint = log_or_nothing(predicted) + jnp.where(is_present, log_factors, 0.0)
+        increment = jnp.where(is_present, log_sum_exp(log_joint), 0.0)
         posterior = softmax(log_joint)
         return posterior, (posterior, increment)
 

@@ -19,6 +19,7 @@ from mpfjax.moves.base import (
     AbstractPropagation,
     AbstractRegrouping,
     AbstractWrapper,
+    Regrouped,
     Step,
 )
 from mpfjax.moves.propagation.propagate import noise_of_slots, weigh
@@ -120,9 +121,7 @@ class RegroupTwisted(AbstractWrapper, AbstractRegrouping):
 
     holds = ("move",)
 
-    def regroup(
-        self, key: Key[Array, ""], mixture: ParticleMixture
-    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+    def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The move's indicators under the weights times ν_{t+1}."""
         log_factors = self.twist.log_normaliser(mixture.t + 1, mixture)
         log_weights = mixture.reweight(log_factors).log_weights

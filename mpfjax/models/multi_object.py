@@ -15,13 +15,12 @@ from mpfjax.checks import Checked, Count, check_one_each
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
-    check_moved,
     is_made_of_noise,
     real_each,
     replace_fields,
     with_inputs,
 )
-from mpfjax.models.law import refuse_marginalised
+from mpfjax.models.law import Law, refuse_marginalised
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import select_rows
@@ -299,11 +298,9 @@ def _has_axis(model: Any, num_objects: int) -> bool:
 def _finds_object_axis(model: Any, num_objects: int) -> bool:
     """Whether the arrays have an object axis, because as one model for all it cannot be drawn."""
 
-    def draw() -> None:
-        key = jax.random.key(0)
-        states = model.sample_initial(key, _TRIAL)
-        check_one_each(_TRIAL, sample_initial=states)
-        check_moved(model.sample_transition(key, states), states, model)
+    def draw() -> PyTree:
+        law, key = Law(model), jax.random.key(0)
+        return law.draw(key, law.sample_initial(key, _TRIAL))
 
     try:
         eqx.filter_eval_shape(draw)

@@ -31,7 +31,7 @@ from mpfjax.models.observations import (
     require_inputs,
     steps_where,
 )
-from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 
 _EXACT, _FAR = 2**24, 2**17  # float32 holds whole numbers up to the first, and 1/64 at the second
 
@@ -111,9 +111,7 @@ def steps_of_inputs(
         raise ValueError(f"inputs: their t is {own_length}, and that of the {of_what} is {length}")
     usable = steps_where(arrays, "all", USABLE[NOT_FINITE])
     inspect = getattr(innermost(model), "check_inputs", None)
-    if inspect is not None and not any(
-        isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arrays)
-    ):
+    if inspect is not None and not is_traced(arrays):
         inspect(arrays)
     return refuse_where(~usable, arrays, f"inputs: {NOT_FINITE}")
 

@@ -56,8 +56,4 @@ class Every(AbstractWrapper):
         # As after the moves, which run at every k-th step alone: both have one form.
         mixture = mixture.replace(memory=memory).with_order(False)
         runs = steps == self.every
-
-        def run() -> ParticleMixture:
-            return in_turn(key, self.moves, mixture, now)
-
-        return jax.lax.cond(runs, run, lambda: mixture)
+        return jax.lax.cond(runs, lambda: in_turn(key, self.moves, mixture, now), lambda: mixture)

@@ -11,6 +11,7 @@ from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagationOfEach, AbstractWrapper, Step
 from mpfjax.moves.propagation.propagate import Propagate
+from mpfjax.operations.logarithms import finite_or_zero
 from mpfjax.operations.random import split, uniform
 from mpfjax.operations.stored import take
 
@@ -57,8 +58,7 @@ class PropagateNested(AbstractPropagationOfEach, AbstractWrapper):
         families = self.propagate(key_draws, repeated, now)
         shares = uniform(key_kept, (n,), mixture.log_weights.dtype)
         log_weights = families.log_weights.reshape(n, k)
-        largest = jnp.max(log_weights, axis=1, keepdims=True)
-        largest = jnp.where(largest > -jnp.inf, largest, 0.0)
+        largest = finite_or_zero(jnp.max(log_weights, axis=1, keepdims=True))
         weights = jnp.exp(log_weights - largest)
         upto = jnp.cumsum(jax.lax.stop_gradient(weights), axis=1)
         shares = shares.astype(upto.dtype)

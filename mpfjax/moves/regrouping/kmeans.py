@@ -13,6 +13,7 @@ from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.segments import segment_argmax, segment_counts, segment_sum
 from mpfjax.operations.stored import most_of_runs
 
+Nearest = tuple[Float[Array, " n"], Int[Array, " n"]]
 # Centroids in one pass over the particles. A program of all 64 takes seconds to compile.
 _AT_ONCE = 16
 
@@ -41,10 +42,9 @@ class KMeans(AbstractRegrouping, ByFeatures):
     def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The component with the nearest centroid, for each particle."""
         features, occupied, m = self.features_of(mixture), mixture.occupied, mixture.num_components
+        labels = mixture.component_indicators
         if self.reseed:
             labels = farthest_first(features, occupied, m)
-        else:
-            labels = mixture.component_indicators
         filled = jnp.where(occupied[:, None], features, 0.0)
 
         def iterate(_: int | Int[Array, ""], labels: Int[Array, " n"]) -> Int[Array, " n"]:
@@ -107,11 +107,8 @@ def nearest(
 
 
 def _nearer(
-    so_far: tuple[Float[Array, " n"], Int[Array, " n"]],
-    features: Rows,
-    centroids: Float[Array, "m k"],
-    first: int | Int[Array, ""],
-) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
+    so_far: Nearest, features: Rows, centroids: Float[Array, "m k"], first: int | Int[Array, ""]
+) -> Nearest:
     """The least squared distance so far and whose it is, after these centroids as well."""
     best, labels = so_far
     for m in range(centroids.shape[0]):
