@@ -14,18 +14,7 @@ from mpfjax.checks import array_of, as_numbers, check_shape, shown
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models import gaussians
 from mpfjax.models.base import AbstractStateSpaceModel, check_moved, model_name, real_each
-from mpfjax.models.gaussians import (
-    Gaussian,
-    Linear,
-    apply,
-    cholesky,
-    particles_first,
-    particles_last,
-    product,
-    solve_lower,
-    solve_upper,
-    transpose,
-)
+from mpfjax.models.gaussians import Gaussian, Linear, apply, particles_first, particles_last
 from mpfjax.models.law import Law
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.logarithms import default_float
@@ -171,7 +160,7 @@ class MixedLaw(MarginalisedLaw):
         """z_t ~ N(f + A m, A P Aᵀ + V), made of this standard normal noise."""
         mixed, _ = latent_dynamics_of(self.model, states)
         law = gaussians.predict(filtered_gaussian(self.model, states), mixed)
-        drawn = law.mean + apply(cholesky(law.covariance), noise.T.astype(law.mean.dtype))
+        drawn = law.mean + apply(gaussians.cholesky(law.covariance), noise.T.astype(law.mean.dtype))
         return drawn.T.reshape(states.latent.shape)
 
     def noise_dimension(self, states: PyTree) -> int:
@@ -213,24 +202,8 @@ def predicted_gaussian(model: Any, latent: PyTree, state: MarginalisedState) -> 
     if is_mixed(model):
         mixed, shared = latent_dynamics_of(model, state)
         law, _ = gaussians.update_by_all(law, latent_rows(model, latent), mixed)
-        dynamics = decorrelate(dynamics, mixed, shared, latent_rows(model, latent))
+        dynamics = gaussians.decorrelate(dynamics, mixed, shared, latent_rows(model, latent))
     return gaussians.predict(law, dynamics)
-
-
-def decorrelate(
-    dynamics: Linear, mixed: Linear, shared: Float[Array, "d k n"] | None, latent: Array
-) -> Linear:
-    """The dynamics of x given z_t, where their noises are correlated: v is z_t - f - A x."""
-    if shared is None:
-        return dynamics
-    factor = cholesky(mixed.noise, floor=True)
-    half = solve_lower(factor, transpose(shared))
-    slope = transpose(solve_upper(factor, half))
-    return Linear(
-        dynamics.matrix - product(slope, mixed.matrix),
-        dynamics.offset + apply(slope, latent - mixed.offset),
-        dynamics.noise - product(transpose(half), half),
-    )
 
 
 def latent_rows(model: Any, latent: Any) -> Float[Array, "k n"]:

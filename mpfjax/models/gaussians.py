@@ -178,6 +178,22 @@ def through(dynamics: Linear, emission: Linear) -> Linear:
     )
 
 
+def decorrelate(
+    dynamics: Linear, mixed: Linear, shared: Float[Array, "d k n"] | None, latent: Array
+) -> Linear:
+    """The dynamics of x given z_t, where their noises are correlated: v is z_t - f - A x."""
+    if shared is None:
+        return dynamics
+    factor = cholesky(mixed.noise, floor=True)
+    half = solve_lower(factor, transpose(shared))
+    slope = transpose(solve_upper(factor, half))
+    return Linear(
+        dynamics.matrix - product(slope, mixed.matrix),
+        dynamics.offset + apply(slope, latent - mixed.offset),
+        dynamics.noise - product(transpose(half), half),
+    )
+
+
 def update(
     state: Gaussian, observation: Float[Array, "p #n"], emission: Linear
 ) -> tuple[Gaussian, Float[Array, " n"]]:

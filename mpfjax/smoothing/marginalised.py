@@ -136,7 +136,7 @@ def _before(
         mixed, shared = linear.latent_dynamics_of(model, before)
         rows = linear.latent_rows(model, latent)
         likelihood = _likelihood(rows, mixed, law)
-        dynamics = linear.decorrelate(dynamics, mixed, shared, rows)
+        dynamics = gaussians.decorrelate(dynamics, mixed, shared, rows)
     emission = linear.emission_of(model, latent, before)
     if emission is not None:
         target = linear.observation_rows(model, observation, emission, before.mean.dtype)
@@ -144,7 +144,7 @@ def _before(
         through = gaussians.through(dynamics, emission)
         likelihood = _add(likelihood, _likelihood(target, through, law))
         shared = product(dynamics.noise, transpose(emission.matrix))
-        dynamics = linear.decorrelate(dynamics, through, shared, target)
+        dynamics = gaussians.decorrelate(dynamics, through, shared, target)
     matrix, offset, noise = dynamics
     precision, vector, centre = future
     offset = offset + apply(matrix, law.mean) - centre
