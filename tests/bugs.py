@@ -36,8 +36,8 @@ BUGS = {
         "tests/moves/test_bernoulli.py -k sensors_in_turn",
     ),
     "the proposal's density has the wrong sign": Bug(
-        "log_factors.append(law.log_transition(draws, previous) - log_density)",
-        "log_factors.append(law.log_transition(draws, previous) + log_density)",
+        "[now.law.log_transition(draws, previous) - log_density]",
+        "[now.law.log_transition(draws, previous) + log_density]",
         "tests/together/test_exact_answers.py -k guided",
     ),
     "Metropolis moves forget where they are": Bug(

@@ -15,7 +15,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 from mpfjax.mixture import ParticleMixture, points
-from mpfjax.moves.resampling import sorting
+from mpfjax.moves.resampling.sorting import (
+    BITS,
+    MOST_DIMENSIONS,
+    hilbert_index,
+    order_by_key,
+    order_by_segment,
+    sortable_bits,
+)
 from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing, softmax
 from mpfjax.operations.prefix_sums import Positions, needs_units, sum_before, to_units, unit_bits
 from mpfjax.operations.segments import column_sums, segment_counts, segment_reduce, spread
@@ -158,7 +165,7 @@ def in_line(mixture: ParticleMixture, stays: Bool[Array, " n"] | None, along_cur
         is_mixed = jnp.any(labels[1:] < labels[:-1])
         order, log_weights, labels = cond_if_any(
             is_mixed,
-            lambda: in_order(sorting.order_by_segment(labels, m)),
+            lambda: in_order(order_by_segment(labels, m)),
             lambda: (jnp.arange(labels.shape[0], dtype=jnp.int32), log_weights, labels),
         )
     log_largest = finite_or_zero(segment_reduce("max", log_weights, labels, m, -jnp.inf))
@@ -177,14 +184,14 @@ def sorted_order(mixture: ParticleMixture, labels: Int[Array, " n"]) -> Int[Arra
     of the particle's component. More than 8 are reduced to their first principal components.
     """
     rows = _coordinates(mixture)
-    if rows.shape[0] > sorting.MOST_DIMENSIONS:
+    if rows.shape[0] > MOST_DIMENSIONS:
         rows = _principal(rows, mixture)
     if rows.shape[0] == 1:
-        keys = sorting.sortable_bits(rows[0])
+        keys = sortable_bits(rows[0])
     else:
-        num_bits = sorting.BITS // rows.shape[0]
-        keys = sorting.hilbert_index(_cells(rows, mixture, num_bits), num_bits)
-    return sorting.order_by_key(keys, labels, mixture.num_components + 1)
+        num_bits = BITS // rows.shape[0]
+        keys = hilbert_index(_cells(rows, mixture, num_bits), num_bits)
+    return order_by_key(keys, labels, mixture.num_components + 1)
 
 
 def _coordinates(mixture: ParticleMixture) -> Float[Array, "d n"]:
