@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
-from mpfjax.models.law import Law, refuse_marginalised
+from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.moves.base import AbstractMarkovMove, Gradient, Step
 from mpfjax.operations.logarithms import add_gradient, without_gradient
 from mpfjax.operations.random import split, uniform
@@ -26,14 +26,14 @@ _LEAST_STEP = 0.02
 class _Target(NamedTuple):
     """The target of every particle: D(x_t | x_{t-1}) L(y_t | x_t), given its parent."""
 
-    law: Law
+    model: Any
     parents: PyTree
     observation: PyTree
 
     def __call__(self, states: PyTree) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """log D and log L, separately: with a large constant in L, their sum loses digits of D."""
-        log_likelihood = self.law.log_likelihood(self.observation, states)
-        return self.law.log_transition(states, self.parents), log_likelihood
+        log_likelihood = law_of(self.model).log_likelihood(self.observation, states)
+        return law_of(self.model).log_transition(states, self.parents), log_likelihood
 
     def ratio(self, new: tuple[Array, Array], old: tuple[Array, Array]) -> Float[Array, " n"]:
         """log π(x') - log π(x)."""
@@ -87,7 +87,7 @@ class AbstractMetropolis(AbstractMarkovMove):
         if mixture.parents is None:
             who = f"moves: {type(self).__name__}"
             raise ValueError(f"{who} comes before any propagation: there is no x_t yet")
-        target = _Target(now.law, mixture.parents, now.observation)
+        target = _Target(now.model, mixture.parents, now.observation)
         states = mixture.particles
         if self.gradient == "stop":
             states = without_gradient(states)
@@ -125,7 +125,8 @@ class RandomWalkMetropolis(AbstractMetropolis):
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """x + s (a - b) / √2, whose reverse step has the same density."""
         rows, back = _as_rows(states)
-        a, b = (_as_rows(target.law.draw(each, target.parents))[0] for each in split(key, 2))
+        draws = [target.model.sample_transition(each, target.parents) for each in split(key, 2)]
+        a, b = (_as_rows(each)[0] for each in draws)
         step = length.astype(rows.dtype)[:, None] * without_gradient(a - b) / math.sqrt(2)
         return back(rows + step), jnp.zeros_like(length)
 
