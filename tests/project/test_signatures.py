@@ -38,7 +38,6 @@ DIFFERENT = {
     "num_seeds",  # of a gradient, of a matrix of derivatives
     "reassembly",  # the paper's of its filter; the unbiased one of a move
     "regroup_every",  # a Gaussian of two modes loses both, a component of particles does not
-    "resample",  # where None is the one that fits the number of targets
 }
 
 
