@@ -595,7 +595,7 @@ def test_regenerated_objects_have_the_covariance_of_their_weights_and_more_slots
 
     def redrawn(key, states):
         particles = mixture.particles.at[-2 * n :].set(states.reshape(-1, 1).astype(jnp.float32))
-        return RegenerateObjects()(key, mixture.replace(particles=particles))
+        return RegenerateObjects().resample(key, mixture.replace(particles=particles))
 
     moved = jax.jit(jax.vmap(redrawn))(jax.random.split(KEY, 400), states)
     indicators, draws = np.asarray(moved.component_indicators[0]), np.asarray(moved.particles)
