@@ -127,7 +127,7 @@ class TestMerge:
         memory = merge.initial_memory(mpfjax.Step(MODEL, None), 6)
         merged = []
         for mixture in (near, near, far, near, near, near, near):
-            moved = eqx.filter_jit(merge)(KEY, mixture.replace(memory=memory))
+            moved = eqx.filter_jit(merge)(KEY, mixture.replace(memory=memory), AT_START)
             memory = moved.memory
             merged.append(int(moved.component_indicators[-1]) == 0)
         # After a merge both labels start a count of their own.
@@ -228,7 +228,7 @@ class TestPoolAndRandomPartition:
 
     def test_every_particle_comes_into_every_set_equally_often(self):
         move = RandomPartition()
-        draw = jax.jit(jax.vmap(lambda key: move(key, self.PAIR).component_indicators))
+        draw = jax.jit(jax.vmap(lambda key: move(key, self.PAIR, AT_START).component_indicators))
         labels = np.asarray(draw(jax.random.split(KEY, 4000)))
         assert np.abs(labels.mean(axis=0) - 11 / 23).max() < 4.5 * 0.5 / np.sqrt(4000)
         together = np.mean(labels[:, :1] == labels[:, 1:], axis=0)
