@@ -250,9 +250,9 @@ class TestGroupBy:
         labels = np.array([0, label, 0], np.int32)
         group = GroupBy(lambda states: jnp.asarray(labels) + 0 * states.astype(jnp.int32))
         weightless = make_mixture(np.zeros(3), [0.0, -np.inf, 0.0], [0, 0, 0], 2)
-        assert int(group(KEY, weightless).component_indicators.max()) < 2
+        assert int(group(KEY, weightless, AT_START).component_indicators.max()) < 2
         weighed = make_mixture(np.zeros(3), np.zeros(3), [0, 0, 0], 2)
-        assert np.isnan(group(KEY, weighed).log_scale)
+        assert np.isnan(group(KEY, weighed, AT_START).log_scale)
         moves = [Resample(), Propagate(), GroupBy(lambda states: 2 * side(states))]
         with pytest.raises(RuntimeError, match="GroupBy"):
             mpfjax.run_filter(KEY, Filter(MODEL, moves, 20, 2), jnp.ones(3))
