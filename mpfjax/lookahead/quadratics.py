@@ -9,13 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from mpfjax.operations.matrices import (
-    Coordinates,
-    coordinates,
-    inner,
-    log_total,
-    transform,
-)
+from mpfjax.operations.matrices import Coordinates, coordinates, inner, log_total, transform
 
 Index = Int[Array, ""]
 

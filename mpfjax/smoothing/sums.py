@@ -168,12 +168,7 @@ class FixedLagSmoother(Checked):
 
     @checked
     def step(
-        self,
-        key: Key[Array, ""],
-        window: Window,
-        observation: PyTree,
-        *,
-        inputs: PyTree = None,
+        self, key: Key[Array, ""], window: Window, observation: PyTree, *, inputs: PyTree = None
     ) -> tuple[Window, PyTree, StepInfo]:
         """The next window, the estimates of r = t - L, ..., t, and the filter's report.
 

@@ -13,13 +13,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.series import Series
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State
 from mpfjax.tuning.chains import warn_of_invalid
-from mpfjax.tuning.densities import (
-    LogPrior,
-    SamplePrior,
-    checked_prior,
-    drawn,
-    require_same_prior,
-)
+from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn, require_same_prior
 from mpfjax.tuning.evidence import UnbiasedFilter, one_sequence, pose_evidence, with_present
 from mpfjax.tuning.parameter_particles import Sampler, extend, rejuvenate, start
 from mpfjax.tuning.problem import Parameters, Problem, Transforms
