@@ -115,7 +115,8 @@ class _Sampler(NamedTuple):
             initial = normal(key_initial, (number, self.model.initial_noise_dimension))
         else:
             initial = law_of(self.model).sample_initial(key_initial, number)
-        return self.paths_from(initial, bits(key_draws, (number, self.window.length, 2)))
+        words = bits(key_draws, (2 * number * self.window.length,))
+        return self.paths_from(initial, words.reshape(number, self.window.length, 2))
 
     def paths_from(self, initial: PyTree, keys: UInt32[Array, "n steps 2"]) -> _Paths:
         """Paths from these x_0, before any observation."""
@@ -199,7 +200,7 @@ class _Sampler(NamedTuple):
             return paths.log_past + jnp.where(power > 0, power * paths.log_likelihood, 0.0)
 
         def step(i: Int[Array, ""], paths: _Paths) -> _Paths:
-            words = bits(jax.random.fold_in(key, i), (6 + 2 * d, number))
+            words = bits(split(key, STEP_MOVES + PATH_STEPS)[i], (6 + 2 * d, number))
             is_of_step = i < STEP_MOVES
             first, new = jnp.where(is_of_step, s, 0), propose(words[1:], paths, is_of_step)
             new = jax.lax.fori_loop(first, s + 1, self.advance, new)
