@@ -58,9 +58,9 @@ COLUMNS = {
 }
 OF_ROOMS = {
     "filter": "{filter}",
-    "error at the end": "{masses_rmse:.3f}",
+    "error at the end": "{masses_rmse:.3f} ± {masses_rmse_error:.3f}",
     "below .001": "{masses_lost:.2f}",
-    "error after 15 scans": "{masses_after_rmse:.3f}",
+    "error after 15 scans": "{masses_after_rmse:.3f} ± {masses_after_rmse_error:.3f}",
     "below .001 then": "{masses_after_lost:.2f}",
 }
 
@@ -204,7 +204,8 @@ def errors_of_masses(masses: list[np.ndarray]) -> dict[str, float]:
     errors = {}
     for t, name in enumerate(("masses", "masses_after") if masses else ()):
         at = np.concatenate(masses)[:, t]
-        errors[f"{name}_rmse"] = float(np.sqrt(np.mean((at - 1 / at.shape[1]) ** 2)))
+        squares = np.mean((at - 1 / at.shape[1]) ** 2, axis=1)
+        errors[f"{name}_rmse"], errors[f"{name}_rmse_error"] = harness.rms_and_error(squares)
         errors[f"{name}_lost"] = float(np.mean(at < 1e-3))
     return errors
 
