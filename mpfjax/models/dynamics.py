@@ -12,7 +12,7 @@ from mpfjax.arrays import FINITE, NOT_NEGATIVE, POSITIVE, Fitting, to_array, to_
 from mpfjax.checks import SHARES, InnerShare
 from mpfjax.models.gaussians import log_normal
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
-from mpfjax.operations.random import fast_key, normal, split_once
+from mpfjax.operations.random import fast_key, normal, split
 
 Rows = Float[Array, "n d"]
 Deviations = Annotated[Float[Array, "*n d"], POSITIVE]
@@ -144,7 +144,7 @@ class RandomWalkWithJumps(RandomWalk):
 
     def sample_step(self, key: Key[Array, ""], num_rows: int, dtype: jnp.dtype) -> Rows:
         """Steps whose lengths and directions are drawn from separate keys."""
-        key_noise, key_jump = split_once(key, 2)
+        key_noise, key_jump = split(key, 2)
         # In one row, which is drawn fast; the numbers are those of n rows.
         jumps = jax.random.bernoulli(fast_key(key_jump), self.jump_probability, (num_rows,))
         noise = normal(key_noise, (num_rows, self.deviations.shape[-1]), dtype)

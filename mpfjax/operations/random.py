@@ -58,27 +58,35 @@ def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
     does not take it beside an ordinary key). A key of another generator is returned as it is. So
     is every key if JAX is set not to number its draws (`jax_threefry_partitionable`).
     """
-    is_numbered = jax.config.jax_threefry_partitionable  # pyright: ignore[reportAttributeAccessIssue]
-    if not is_numbered or jax.random.key_impl(key) != "threefry2x32":
+    if not _is_numbered(key):
         return key
     return jax.random.wrap_key_data(jax.random.key_data(key), impl=_UNROLLED)
 
 
+def _is_numbered(key: Key[Array, "*shape"]) -> bool:
+    """Whether a draw is the hash of its number under the key."""
+    is_numbered = jax.config.jax_threefry_partitionable  # pyright: ignore[reportAttributeAccessIssue]
+    return is_numbered and jax.random.key_impl(key) == "threefry2x32"
+
+
 def split(key: Key[Array, "*keys"], num: int) -> Key[Array, " num"]:
-    """`jax.random.split`; keys that are split stay. A longer split starts with the same keys."""
-    return key if key.ndim else jax.random.split(key, num)
+    """`jax.random.split`, the same keys; keys that are split stay.
 
-
-def split_once(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
-    """`split`, computed once, where XLA on a CPU would hash again in all that uses the keys.
-
-    Use it between two splits: with XLA's older emitters (`in_little_memory`), a draw whose key was
-    split three times takes seconds to compile, since each word of a key is hashed from both words
-    of the one before.
+    A longer split starts with the same keys. On a CPU the rounds of Threefry are written out, since
+    XLA's loop over them is ten kernels, and each takes time to compile. The keys are stored, since
+    XLA would hash again in all that uses them.
     """
-    keys = split(key, num)
-    words = stored(jax.random.key_data(keys))
-    return jax.random.wrap_key_data(words, impl=jax.random.key_impl(keys))
+    if key.ndim or not _is_numbered(key):
+        return key if key.ndim else jax.random.split(key, num)
+    return _split_unrolled(key, num)
+
+
+@partial(jax.jit, static_argnums=1)
+def _split_unrolled(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
+    index = jax.lax.iota(jnp.uint32, num)
+    words = threefry(jax.random.key_data(key), jnp.zeros_like(index), index)
+    words = stored(jnp.stack(words, axis=1))
+    return jax.random.wrap_key_data(words, impl="threefry2x32")
 
 
 def uniform(

@@ -1,5 +1,7 @@
 """The fast generator draws what the stock one draws, bit for bit."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +16,6 @@ from mpfjax.operations.random import (
     normal,
     normal_quantile,
     split,
-    split_once,
     threefry,
     uniform,
 )
@@ -49,9 +50,12 @@ def test_the_same_bits_alone_and_under_jit_and_vmap(name):
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])
-def test_a_split_that_is_stored_is_the_same(impl):
-    key = jax.random.key(3, impl=impl)
-    same_keys(jax.jit(split_once, static_argnums=1)(key, 7), jax.random.split(key, 7))
+def test_a_split_is_the_stock_one_alone_and_under_jit_and_vmap(impl):
+    keys = jax.random.split(jax.random.key(3, impl=impl), 2)
+    same_keys(split(keys[0], 7), jax.random.split(keys[0], 7))
+    same_keys(jax.jit(split, static_argnums=1)(keys[0], 7), jax.random.split(keys[0], 7))
+    each = (jax.vmap(partial(way, num=7))(keys) for way in (split, jax.random.split))
+    same_keys(*each)
 
 
 def test_other_settings_and_generators_are_left_alone():

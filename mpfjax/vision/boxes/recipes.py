@@ -28,7 +28,7 @@ from mpfjax.moves.regrouping.partitions import GroupBy
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
-from mpfjax.operations.random import split_once
+from mpfjax.operations.random import split
 from mpfjax.report import with_densities
 from mpfjax.transforms import with_resampling
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
@@ -48,8 +48,8 @@ def paper_filters(frame: Frame, boxes: Boxes) -> dict[str, Filter]:
     model = with_one_reference(ColourModel.from_frame(frame, boxes, sigma=0.15))
     where: dict[str, Any] = {"features": _centre, "scale": size}
     merge = Merge(None, max_distance=0.5, **where)
-    split = Split(4.0, min_distance=0.5, min_share=0.15, **where)
-    where |= {"regroup": [merge, split, KMeans(5, **where)], "regroup_every": 1}
+    splitting = Split(4.0, min_distance=0.5, min_share=0.15, **where)
+    where |= {"regroup": [merge, splitting, KMeans(5, **where)], "regroup_every": 1}
     mixture = mixture_particle_filter(model, NUM_PARTICLES, MAX_COMPONENTS, **where)
     mixture = with_resampling(mixture, Resample(particles_per_component=PARTICLES_PER_COMPONENT))
     return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
@@ -238,7 +238,7 @@ def follow_boxes(
 
 
 def _advance_boxes(filter, num_objects, key, t, mixture, counted):
-    step_keys = split_once(jax.random.fold_in(key, t), len(filter.moves))
+    step_keys = split(jax.random.fold_in(key, t), len(filter.moves))
     mixture, info = filter._step(step_keys, mixture, counted)
     best, exists = best_components(mixture, num_objects)
     means = mixture.component_expectations(filter.model.boxes(mixture.particles))
