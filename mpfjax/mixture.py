@@ -31,6 +31,7 @@ from mpfjax.operations.logarithms import (
 )
 from mpfjax.operations.prefix_sums import sum_before
 from mpfjax.operations.segments import (
+    segment_any,
     segment_counts,
     segment_log_sum_exp,
     segment_softmax,
@@ -187,7 +188,10 @@ class ParticleMixture(eqx.Module):
     @property
     def active(self) -> Bool[Array, " m"]:
         """Which components have particles."""
-        return self.component_counts > 0
+        self._require_one()
+        if self.num_components == 1:
+            return jnp.any(self.occupied)[None]
+        return segment_any(self.occupied, self.component_indicators, self.num_components)
 
     @property
     def component_weights(self) -> Float[Array, " n"]:

@@ -11,6 +11,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mpfjax.operations.logarithms import (
@@ -36,6 +37,9 @@ _LANES = 8
 _FEW_COLUMNS = 9
 # In float32, a million equal numbers, added one after the other, give a thousandth too much.
 _LONGEST_SUM = 2**10
+# The segments that occur are kept in the bits of at most this many words.
+_WORD, _MOST_WORDS = 32, 8
+_WORD_BITS = 5  # a word has 2^5 bits
 _REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
 
 
@@ -81,6 +85,25 @@ def column_sums(
 def are_masked(n: int, num_segments: int) -> bool:
     """Whether n entries are summed by a mask for each segment."""
     return num_segments <= FEW_SEGMENTS or n * num_segments <= _FEW_MASKED
+
+
+@partial(jax.jit, static_argnames="num_segments")
+def segment_any(
+    mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Bool[Array, " num_segments"]:
+    """Which segments have a masked entry; labels are in [0, num_segments)."""
+    if num_segments > _MOST_WORDS * _WORD:
+        return segment_counts(mask, segments, num_segments) > 0
+    word_of, bit = segments >> _WORD_BITS, (segments & (_WORD - 1)).astype(jnp.uint32)
+    bits = jnp.uint32(1) << bit
+    words = []
+    for word in range(-(-num_segments // _WORD)):
+        of_word = jnp.where(mask & (word_of == word), bits, jnp.uint32(0))
+        words.append(jax.lax.reduce(of_word, np.uint32(0), jax.lax.bitwise_or, (0,)))
+    # Not gathered by label: XLA would read all particles again for each.
+    shifts = jnp.arange(_WORD, dtype=jnp.uint32)
+    occurs = (jnp.stack(words)[:, None] >> shifts[None]) & 1 > 0
+    return occurs.reshape(-1)[:num_segments]
 
 
 def segment_reduce(

@@ -21,6 +21,7 @@ from mpfjax.operations.matrices import (
 )
 from mpfjax.operations.prefix_sums import count_starts, count_upto, sum_before, to_units, unit_bits
 from mpfjax.operations.segments import (
+    segment_any,
     segment_argmax,
     segment_counts,
     segment_log_sum_exp,
@@ -105,6 +106,7 @@ def of_segments(values, labels, num_segments):
     table = segment_sum(values, labels, num_segments)
     return {
         "sum": table,
+        "any": segment_any((one > 0) & (labels < num_segments), labels, num_segments),
         "max": segment_reduce("max", one, labels, num_segments, -jnp.inf),
         "argmax": segment_argmax(one, labels, num_segments),
         "counts": segment_counts(one > 0, labels, num_segments),
@@ -129,6 +131,7 @@ def test_segments(m, n):
     for s in range(m):
         own, logs = values[labels == s, 0], values[labels == s, 1].astype(float)
         close(found["sum"][s, 0], own.sum())
+        assert found["any"][s] == (own > 0).any()
         assert found["max"][s] == own.max(initial=-np.inf)
         assert own.size == 0 or labels[found["argmax"][s]] == s
         assert own.size == 0 or values[found["argmax"][s], 0] == own.max()
