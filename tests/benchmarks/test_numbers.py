@@ -1,14 +1,20 @@
-"""What commands compute beside filters: against exact answers, and counted by hand."""
+"""What commands compute beside filters, draw, and measure: against exact answers, and by hand."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks import tracking_quality as quality
 from benchmarks.coverage import coverage, covers
 from benchmarks.localisation.filters import AdaptiveMonteCarlo
 from benchmarks.masses.scenes import SCENES
 from benchmarks.partitioned_sampling.posterior import distance_maps
+from benchmarks.scenes import distracter_scene
+from benchmarks.visual_tracking.following import Snapshot, follow, track_rows
+from mpfjax.metrics.tracking_scores import overlap
+from mpfjax.vision.boxes.recipes import PRESETS
+from tests.marking import weekly
 
 
 @pytest.mark.exactness
@@ -82,3 +88,121 @@ def test_coverage_strays_and_swaps_by_hand():
     boxes = np.array([(x - 2, y - 3, 4, 6) for x, y in centres])
     reached = covers(boxes, np.array([[0.0, 0, 10, 20]]))[:, 0]
     assert reached.tolist() == [True, False, True, False, True]
+
+
+G = jnp.array([10.0, 20.0, 40.0, 20.0])
+
+
+def box(x, y, w, h):
+    return jnp.array([x, y, w, h], float)
+
+
+@pytest.mark.parametrize(
+    "estimate", [box(20, 25, 0, 10), box(20, 25, -10, -10), box(jnp.nan, 25, 10, 10)]
+)
+def test_a_box_without_area_or_place_tracks_nothing(estimate):
+    assert not quality.track_state(estimate, G)
+    assert quality.precision(estimate, G) == quality.recall(estimate, G) == 0
+
+
+def test_areas_are_those_of_the_overlap():
+    """Which is the shared area over that of both."""
+    rng = np.random.default_rng(0)
+    boxes = np.concatenate([rng.uniform(0, 30, (50, 2, 2)), rng.uniform(1, 25, (50, 2, 2))], axis=2)
+    area, ratio = boxes[..., 2:].prod(axis=2), np.diag(overlap(boxes[:, 0], boxes[:, 1]))
+    shared = ratio * area.sum(axis=1) / (1 + ratio)
+    estimates, truth = jnp.asarray(boxes[:, 0]), jnp.asarray(boxes[:, 1])
+    np.testing.assert_array_equal(quality.track_state(estimates, truth), shared > 0)
+    for measure, of in ((quality.precision, area[:, 0]), (quality.recall, area[:, 1])):
+        np.testing.assert_allclose(measure(estimates, truth), shared / of, rtol=1e-4, atol=1e-6)
+
+
+# Four runs of five frames: throughout, lost and back, lost for good, back only just.
+STATES = jnp.array([[1, 1, 1, 1, 1], [1, 0, 0, 1, 1], [1, 1, 0, 0, 0], [1, 0, 0, 0, 1]], bool)
+
+
+def test_rates_by_hand():
+    assert float(quality.success_rate(STATES)) == 0.25
+    assert float(quality.recovery_rate(STATES)) == 0.75
+    assert float(quality.recovery_rate(STATES, num_last=2)) == 0.5
+    both = jnp.stack([STATES, ~STATES], axis=2)
+    np.testing.assert_array_equal(quality.success_rate(both), [0.25, 0.0])
+    np.testing.assert_array_equal(quality.recovery_rate(both), [0.75, 0.25])
+
+
+def test_hypotheses_differ_where_any_number_does():
+    states = np.zeros((6, 3, 2))
+    states[:, 0] = np.arange(12).reshape(6, 2)
+    states[:, 1, 1] = [1, 2, 1, 2, 1, 9]
+    np.testing.assert_allclose(
+        quality.uniqueness(jnp.asarray(states)), [1.0, 3 / 6, 1 / 6], rtol=1e-6
+    )
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return [distracter_scene(jax.random.key(seed)) for seed in range(12)]
+
+
+def gaps(scene):
+    """How far object 1 is clear of the place of the distracter, in each frame."""
+    offsets = np.abs(scene.boxes[:, 0, :2] - scene.distracter[7, :2])
+    return np.max(offsets - scene.boxes[0, 0, 2:], axis=1)
+
+
+def test_the_distracter_stands_over_object_one_which_walks_away(scenes):
+    for scene in scenes:
+        there = np.isfinite(scene.distracter).all(axis=1)
+        assert (np.flatnonzero(there) + 1).tolist() == [3, 4, 5, 6, 7, 8]
+        for t in np.flatnonzero(there):
+            np.testing.assert_array_equal(scene.distracter[t], scene.boxes[2, 0])
+            assert not overlap(scene.distracter[t][None], scene.boxes[t, 1:]).any()
+        # Corners are rounded to whole pixels.
+        assert 3 <= gaps(scene)[7] <= 13
+        assert gaps(scene)[-1] >= 11
+
+
+def snapshots(references=True):
+    """Three components in three frames of one run; the second dies and its label is used again."""
+    active = np.array([[1, 1, 0], [1, 0, 0], [1, 1, 1]], bool)
+    owners = np.array([[0, 1, 5], [0, 1, 5], [0, 0, 1]])
+    return [
+        Snapshot(
+            means=np.array([[[10.0 + m, 20.0 + frame, 4.0, 6.0] for m in range(3)]]),
+            active=active[frame][None],
+            points=None,
+            labels=None,
+            references=owners[frame][None] if references else None,
+        )
+        for frame in range(3)
+    ]
+
+
+def test_a_track_is_a_life_of_a_component():
+    rows = track_rows(snapshots(references=False), first=7)
+    assert rows[:, :2].tolist() == [[7, 1], [7, 2], [8, 1], [9, 1], [9, 3], [9, 4]]
+    np.testing.assert_allclose(rows[1], [7, 2, 9.0, 17.0, 4.0, 6.0])
+
+
+def test_or_a_hypothesis_about_one_of_the_given_boxes():
+    rows = track_rows(snapshots(), by_reference=True)
+    assert rows[:, :2].tolist() == [[1, 1], [1, 2], [2, 1], [3, 1], [3, 1], [3, 2]]
+
+
+@pytest.mark.exactness
+@pytest.mark.parametrize("name", ["default", *weekly(["paper"])])
+def test_the_recipes_keep_to_objects_that_stand_still(name):
+    """A red and a blue box on grey: a component is on each, and in all three frames."""
+    still, boxes = (
+        np.full((48, 64, 3), 110, np.uint8),
+        np.array([[8.0, 10, 8, 14], [40, 24, 8, 14]]),
+    )
+    for (x, y, w, h), colour in zip(boxes.astype(int), [(220, 10, 10), (10, 10, 220)], strict=True):
+        still[y : y + h, x : x + w] = colour
+    keys = jax.random.split(jax.random.key(0), 1)
+    snapshots = list(follow(keys, PRESETS[name](still, boxes)["mpf"], [still] * 3))
+    assert len(snapshots) == 3
+    for snapshot in snapshots:
+        means = snapshot.means[0][snapshot.active[0]]
+        gaps = np.abs(means[:, None, :2] - boxes[None, :, :2] - [4, 7]).max(axis=2)
+        assert (gaps.min(axis=0) < 3).all()
