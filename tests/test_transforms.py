@@ -6,34 +6,18 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax import (
-    AuxiliaryResample,
-    Every,
-    Filter,
-    KMeans,
-    MultiObjectModel,
-    Propagate,
-    PropagateNested,
-    Resample,
-    with_initial_selection,
-    with_lookahead,
-    with_proposals_per_particle,
-    with_quasi_monte_carlo,
-    with_resampling,
-    with_score_gradient,
-)
 from mpfjax.lookahead.pilot import PilotLookahead
 from mpfjax.moves.initial import SelectInitial
 
-KEY = jax.random.key(0)
+KEY, GUIDE = jax.random.key(0), mpfjax.GaussNewtonProposal()
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
 OBSERVATIONS = np.array([1.5, 1.0, 0.4], np.float32)
 
 
 def own_chain():
     """A chain that no recipe makes, with a resampling from time to time."""
-    moves = [Every(2, [Resample("stratified"), KMeans(2)]), Propagate()]
-    return Filter(MODEL, moves, 32, 2, initial_moves=[KMeans(3, reseed=True)])
+    moves = [mpfjax.Every(2, [mpfjax.Resample("stratified"), mpfjax.KMeans(2)]), mpfjax.Propagate()]
+    return mpfjax.Filter(MODEL, moves, 32, 2, initial_moves=[mpfjax.KMeans(3, reseed=True)])
 
 
 def final(filter):
@@ -44,21 +28,24 @@ def final(filter):
 def test_the_keywords_of_recipes_are_transforms():
     plain = mpfjax.particle_filter(MODEL, 32)
     for keywords, transform in (
-        ({"noise": "rqmc"}, with_quasi_monte_carlo),
-        ({"gradient": "stop"}, with_score_gradient),
+        ({"noise": "rqmc"}, mpfjax.with_quasi_monte_carlo),
+        ({"gradient": "stop"}, mpfjax.with_score_gradient),
     ):
         recipe = mpfjax.particle_filter(MODEL, 32, **keywords)
         chex.assert_trees_all_equal(final(recipe), final(transform(plain)))
+    for filter in (plain, mpfjax.particle_filter(MODEL, 32, proposal=GUIDE)):
+        scored = mpfjax.with_score_gradient(filter)  # which changes derivatives alone
+        chex.assert_trees_all_equal(final(scored), final(filter))
 
 
 @pytest.mark.exactness
 def test_they_compose_on_a_chain_of_ones_own():
     filter = own_chain()
     for change in (
-        with_quasi_monte_carlo,
-        with_score_gradient,
-        lambda f: with_initial_selection(f, 3),
-        lambda f: with_resampling(f, Resample("stratified")),
+        mpfjax.with_quasi_monte_carlo,
+        mpfjax.with_score_gradient,
+        lambda f: mpfjax.with_initial_selection(f, 3),
+        lambda f: mpfjax.with_resampling(f, mpfjax.Resample("stratified")),
     ):
         filter = change(filter)
     every, propagate = filter.moves
@@ -69,38 +56,39 @@ def test_they_compose_on_a_chain_of_ones_own():
 
 
 def test_the_score_gradient_reaches_the_resampling_inside_of_moves():
-    joint = MultiObjectModel(MODEL, 2, shared_observation=True)
-    filter = with_score_gradient(mpfjax.partitioned_sampling(joint, 16))
+    joint = mpfjax.MultiObjectModel(MODEL, 2, shared_observation=True)
+    filter = mpfjax.with_score_gradient(mpfjax.partitioned_sampling(joint, 16))
     resample, partitioned = filter.moves
     assert (resample.gradient, partitioned.resample.gradient) == ("stop", "stop")
 
 
 def test_point_sets_sort_the_chains_own_resampling_alone():
-    filter = with_quasi_monte_carlo(mpfjax.auxiliary_particle_filter(MODEL, 16, PilotLookahead()))
+    filter = mpfjax.with_quasi_monte_carlo(
+        mpfjax.auxiliary_particle_filter(MODEL, 16, PilotLookahead())
+    )
     assert filter.moves[0].resample.along_curve
 
 
 @pytest.mark.exactness
 def test_a_look_ahead_and_proposals_are_put_on_and_taken_off():
     plain = mpfjax.particle_filter(MODEL, 16)
-    guide = mpfjax.GaussNewtonProposal()
-    ahead = with_lookahead(plain, guide)
-    assert isinstance(ahead.moves[0], AuxiliaryResample)
+    ahead = mpfjax.with_lookahead(plain, GUIDE)
+    assert isinstance(ahead.moves[0], mpfjax.AuxiliaryResample)
     assert isinstance(ahead.moves[1].proposal, mpfjax.GaussNewtonProposal)
-    assert isinstance(with_lookahead(plain).moves[0].lookahead, PilotLookahead)
-    guided = mpfjax.particle_filter(MODEL, 16, proposal=guide)
-    chex.assert_trees_all_equal(final(with_lookahead(guided)), final(ahead))
-    several = with_proposals_per_particle(plain, 4)
-    assert isinstance(several.moves[1], PropagateNested)
-    assert with_proposals_per_particle(several, 8).moves[1].num_draws == 8
-    assert isinstance(with_proposals_per_particle(several, 1).moves[1], Propagate)
-    chex.assert_trees_all_equal(final(with_initial_selection(plain, 1)), final(plain))
+    assert isinstance(mpfjax.with_lookahead(plain).moves[0].lookahead, PilotLookahead)
+    guided = mpfjax.particle_filter(MODEL, 16, proposal=GUIDE)
+    chex.assert_trees_all_equal(final(mpfjax.with_lookahead(guided)), final(ahead))
+    several = mpfjax.with_proposals_per_particle(plain, 4)
+    assert isinstance(several.moves[1], mpfjax.PropagateNested)
+    assert mpfjax.with_proposals_per_particle(several, 8).moves[1].num_draws == 8
+    assert isinstance(mpfjax.with_proposals_per_particle(several, 1).moves[1], mpfjax.Propagate)
+    chex.assert_trees_all_equal(final(mpfjax.with_initial_selection(plain, 1)), final(plain))
 
 
 @pytest.mark.exactness
 def test_a_filter_is_replaced_by_its_own_arguments():
     other = mpfjax.QuadraticModel(0.1, 0.5, -2.0, 2.0)
-    filter = with_initial_selection(own_chain(), 3)
+    filter = mpfjax.with_initial_selection(own_chain(), 3)
     changed = filter.replace(model=other, num_particles=50)
     assert changed.num_particles == 50
     assert changed.model is other

@@ -12,14 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from mpfjax import Series
-from mpfjax.smoothing import (
-    FixedLagSmoother,
-    conditional_filter,
-    sample_trajectories,
-    smoothed_sums,
-    trace_ancestors,
-)
+from mpfjax import Series, smoothing
 from tests.registry import CHAINS
 
 NUM_TRAJECTORIES, LAG = 4, 2
@@ -38,12 +31,12 @@ def _of_paths(paths, weights):
 
 
 def _genealogy(key, filter, run):
-    return _of_paths(trace_ancestors(run).trajectories, run.final.weights)
+    return _of_paths(smoothing.trace_ancestors(run).trajectories, run.final.weights)
 
 
 def _backward(**options):
     def smooth(key, filter, run):
-        paths = sample_trajectories(key, filter, run, NUM_TRAJECTORIES, **options)
+        paths = smoothing.sample_trajectories(key, filter, run, NUM_TRAJECTORIES, **options)
         return _of_paths(paths, jnp.full(NUM_TRAJECTORIES, 1 / NUM_TRAJECTORIES))
 
     return smooth
@@ -52,7 +45,7 @@ def _backward(**options):
 def _online(**options):
     def smooth(key, filter, observations):
         series = Series.skipping(observations)
-        found = smoothed_sums(key, filter, series, statistics, **options)
+        found = smoothing.smoothed_sums(key, filter, series, statistics, **options)
         return found.run.log_likelihood_increments, found.sums
 
     return smooth
@@ -60,7 +53,7 @@ def _online(**options):
 
 def _stepwise(key, filter, observations):
     """The terms at t - L, and after the last step those that are left; NaN is missing."""
-    smoother = FixedLagSmoother(filter, statistics, LAG, "mcmc")
+    smoother = smoothing.FixedLagSmoother(filter, statistics, LAG, "mcmc")
     key, *keys = jax.random.split(key, 1 + len(observations))
     window, rows, increments = smoother.init(filter.init(key)), [], []
     for own, seen in zip(keys, np.asarray(observations), strict=True):
@@ -72,7 +65,7 @@ def _stepwise(key, filter, observations):
 
 
 def _conditional(key, filter, observations, trajectory):
-    found = conditional_filter(key, filter, Series.skipping(observations), trajectory)
+    found = smoothing.conditional_filter(key, filter, Series.skipping(observations), trajectory)
     return _of_paths(found.trajectory[None], jnp.ones(1))
 
 
@@ -93,6 +86,17 @@ class Smoother(NamedTuple):
     kernel: Callable | None = None
     lag: int | None = None
     summed: bool = False
+
+    def rows(self, key, filter, observations, trajectory=None):
+        """The increments of log Ẑ, which a kernel has not, and the rows."""
+        if self.of_run:
+            run = mpfjax.run_filter(key, filter, Series.skipping(observations))
+            own = jax.random.fold_in(key, 1)
+            return run.log_likelihood_increments, self.of_run(own, filter, run)
+        if self.online:
+            return self.online(key, filter, observations)
+        rows = self.kernel(key, filter, observations, trajectory)
+        return jnp.zeros(len(observations)), rows
 
 
 SMOOTHERS = {

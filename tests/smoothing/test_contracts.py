@@ -10,14 +10,9 @@ import pytest
 import mpfjax
 from tests.marking import quick_of
 from tests.registry import CHAINS
-from tests.smoothing.registry import (
-    CASES,
-    OBSERVATIONS,
-    QUADRATIC,
-    QUICK_CASES,
-    SMOOTHERS,
-    statistics,
-)
+from tests.smoothing import registry
+from tests.smoothing.registry import OBSERVATIONS, QUADRATIC, SMOOTHERS
+from tests.unbiased import assert_unbiased
 
 NUM_RUNS, LENGTH = 1000, len(OBSERVATIONS)
 GRID = np.linspace(-4.0, 4.0, 401)
@@ -82,34 +77,21 @@ def exact_trajectories():
 
 
 @cache
-def estimates(program, chain):
-    """log Ẑ after each step of many runs, and the rows of each smoother of the program."""
+def estimates(name, chain):
+    """log Ẑ after each step of many runs, and the rows of a smoother."""
     filter, observations = CHAINS[chain](QUADRATIC), jnp.asarray(OBSERVATIONS)
-    smoother = SMOOTHERS.get(program)
+    smoother = SMOOTHERS[name]
 
     def one(key, trajectory):
-        key_run, *keys = jax.random.split(key, 1 + len(SMOOTHERS))
-        if smoother is None:
-            run = mpfjax.run_filter(key_run, filter, mpfjax.Series.skipping(observations))
-            rows = {
-                other: each.of_run(own_key, filter, run)
-                for own_key, (other, each) in zip(keys, SMOOTHERS.items(), strict=True)
-                if each.of_run
-            }
-            return run.log_likelihood_increments, rows
-        if smoother.online:
-            increments, rows = smoother.online(key_run, filter, observations)
-        else:
-            rows = smoother.kernel(key_run, filter, observations, trajectory)
+        increments, rows = smoother.rows(key, filter, observations, trajectory)
+        if smoother.kernel:
             # What the given trajectory has itself is known: the change is known better.
-            rows -= statistics(trajectory[:-1], trajectory[1:])
-            increments = jnp.zeros(LENGTH)
-        return increments, {program: rows}
+            rows -= registry.statistics(trajectory[:-1], trajectory[1:])
+        return increments, rows
 
-    trajectories = jnp.asarray(exact_trajectories()) if smoother and smoother.kernel else None
     keys = jax.random.split(jax.random.key(0), NUM_RUNS)
-    increments, rows = jax.jit(jax.vmap(one))(keys, trajectories)
-    return np.cumsum(np.asarray(increments, float), axis=1), jax.tree.map(np.asarray, rows)
+    increments, rows = jax.jit(jax.vmap(one))(keys, jnp.asarray(exact_trajectories()))
+    return np.cumsum(np.asarray(increments, float), axis=1), np.asarray(rows)
 
 
 def expected_rows(smoother):
@@ -122,41 +104,33 @@ def expected_rows(smoother):
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize(("name", "chain"), quick_of(CASES, QUICK_CASES, one_in=20))
+@pytest.mark.parametrize(
+    ("name", "chain"), quick_of(registry.CASES, registry.QUICK_CASES, one_in=20)
+)
 def test_means_squares_and_pairs_are_the_exact_ones(name, chain):
     """Times Ẑ/Z every estimate is unbiased: within four standard errors."""
     smoother = SMOOTHERS[name]
-    log_evidence, rows = estimates("of a run" if smoother.of_run else name, chain)
+    log_evidence, rows = estimates(name, chain)
     ratios = np.exp(log_evidence - log_evidence.max(axis=0))
     ratios /= ratios.mean(axis=0)
     assert ratios.std(axis=0).max() < 1.5  # or they would prove nothing
     expected, settled = expected_rows(smoother)
     if smoother.kernel:
         expected = 0.0  # of the change
-    errors = ratios[:, settled, None] * (rows[name] - expected)
-    z = errors.mean(axis=0) / (errors.std(axis=0) / np.sqrt(NUM_RUNS))
-    assert np.abs(z).max() < 4, z
+    errors = ratios[:, settled, None] * (rows - expected)
+    assert_unbiased(errors, 0.0)
 
 
 # Nothing seen, a step of zero likelihood between others, and one step alone.
 ODD = {"nothing seen": [np.nan] * 3, "zero likelihood": [1.0, 1e30, np.nan], "one step": [1.0]}
-ONLINE = [name for name, smoother in SMOOTHERS.items() if smoother.online]
+WITH_EVIDENCE = [name for name, smoother in SMOOTHERS.items() if not smoother.kernel]
 
 
 @pytest.mark.parametrize("odd", quick_of(ODD, ["zero likelihood"], one_in=2))
-@pytest.mark.parametrize("name", quick_of(["of a run", *ONLINE], ["of a run"]))
+@pytest.mark.parametrize("name", quick_of(WITH_EVIDENCE, WITH_EVIDENCE[:3]))
 def test_rows_are_finite(name, odd):
-    filter = mpfjax.particle_filter(QUADRATIC, 20)
-    observations = np.float32(ODD[odd])
-    if name == "of a run":
-        run = mpfjax.run_filter(jax.random.key(1), filter, observations, missing="skip")
-        key = jax.random.key(2)
-        rows = [each.of_run(key, filter, run) for each in SMOOTHERS.values() if each.of_run]
-        increments = run.log_likelihood_increments
-    else:
-        increments, rows = SMOOTHERS[name].online(jax.random.key(1), filter, observations)
-        rows = [rows]
-    for each in rows:
-        assert each.shape == (len(observations), 4)
-        assert np.isfinite(each).all()
+    filter, observations = mpfjax.particle_filter(QUADRATIC, 20), np.float32(ODD[odd])
+    increments, rows = SMOOTHERS[name].rows(jax.random.key(1), filter, observations)
+    assert rows.shape == (len(observations), 4)
+    assert np.isfinite(rows).all()
     assert np.isinf(increments).any() == (1e30 in observations)

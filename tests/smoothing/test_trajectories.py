@@ -1,6 +1,7 @@
-"""Trajectories of a component, of mixtures alone, genealogies, and warnings of few paths."""
+"""Trajectories, of a component and of mixtures alone, genealogies, few paths, and sums online."""
 
 import warnings
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -10,7 +11,11 @@ import pytest
 from jax.scipy.stats import norm
 
 import mpfjax
-from mpfjax.smoothing import backward, sample_trajectories, trace_ancestors
+from mpfjax import forecast
+from mpfjax.exact import kalman_filter
+from mpfjax.smoothing import FixedLagSmoother, backward, sample_trajectories, trace_ancestors
+from tests.marking import weekly
+from tests.user_models import Batched, DriftOfOne, ScalarLinear
 
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
 SQUARES = np.array([1.2, 0.8, 1.5, 1.0], np.float32)
@@ -60,37 +65,25 @@ def test_rows_that_do_not_fit_together_are_drawn_in_turn(monkeypatch):
     np.testing.assert_array_equal(together, drawn())
 
 
-class TestGenealogy:
-    @pytest.mark.exactness
-    def test_indices_and_states_are_those_of_a_loop(self):
-        filter = mpfjax.mixture_particle_filter(QUADRATIC, 40, 3)
-        found = mpfjax.run_filter(jax.random.key(4), filter, jnp.asarray(SQUARES))
-        genealogy = jax.tree.map(np.asarray, trace_ancestors(found))
-        ancestors = np.asarray(found.collected.ancestor_indices)
-        states = np.concatenate([found.initial.particles[None], found.collected.particles])
-        labels = np.asarray(found.final.component_indicators)
-        occupied = np.asarray(found.final.occupied)
-        indices = np.arange(40)
-        for t in range(len(SQUARES), -1, -1):
-            np.testing.assert_array_equal(genealogy.indices[t], indices)
-            np.testing.assert_array_equal(genealogy.trajectories[:, t], states[t, indices])
-            for m in range(3):
-                own = occupied & (labels == m)
-                share = len(set(indices[own])) / max(own.sum(), 1)
-                assert genealogy.share_apart[m, t] == pytest.approx(share)
-            if t:
-                indices = ancestors[t - 1][indices]
-
-
-class NoTransition(mpfjax.AbstractStateSpaceModel):
-    def sample_initial(self, key, num_particles):
-        return jnp.zeros(num_particles)
-
-    def sample_transition(self, key, states):
-        return states
-
-    def log_likelihood(self, observation, states):
-        return -((observation - states) ** 2)
+@pytest.mark.exactness
+def test_a_genealogy_is_that_of_a_loop():
+    filter = mpfjax.mixture_particle_filter(QUADRATIC, 40, 3)
+    found = mpfjax.run_filter(jax.random.key(4), filter, jnp.asarray(SQUARES))
+    genealogy = jax.tree.map(np.asarray, trace_ancestors(found))
+    ancestors = np.asarray(found.collected.ancestor_indices)
+    states = np.concatenate([found.initial.particles[None], found.collected.particles])
+    labels = np.asarray(found.final.component_indicators)
+    occupied = np.asarray(found.final.occupied)
+    indices = np.arange(40)
+    for t in range(len(SQUARES), -1, -1):
+        np.testing.assert_array_equal(genealogy.indices[t], indices)
+        np.testing.assert_array_equal(genealogy.trajectories[:, t], states[t, indices])
+        for m in range(3):
+            own = occupied & (labels == m)
+            share = len(set(indices[own])) / max(own.sum(), 1)
+            assert genealogy.share_apart[m, t] == pytest.approx(share)
+        if t:
+            indices = ancestors[t - 1][indices]
 
 
 @pytest.mark.exactness
@@ -109,7 +102,7 @@ def test_what_follows_ancestors_refuses_particles_without_one_parent():
         assert np.isnan(getattr(paths, "trajectories", paths)).all()
 
 
-class Bounded(NoTransition):
+class Bounded(Batched):
     """Steps of more than a thousand are impossible."""
 
     def log_transition(self, states, previous_states):
@@ -161,27 +154,100 @@ def test_a_delta_is_warned_of_with_the_share_of_distinct_trajectories():
     assert f"{num_distinct} of the 200 trajectories are distinct, {share}" in str(caught[0].message)
 
 
-class Known(mpfjax.AbstractStateSpaceModel):
-    """Every particle starts at 0, and few fit what is seen at first."""
-
-    def sample_initial(self, key, num_particles):
-        return jnp.zeros(num_particles)
-
-    def sample_transition(self, key, states):
-        return states + jax.random.normal(key, states.shape)
-
-    def log_transition(self, states, previous_states):
-        return norm.logpdf(states, previous_states)
-
-    def log_likelihood(self, observation, states):
-        return norm.logpdf(observation, states, 0.02)
-
-
 @pytest.mark.exactness
 def test_few_states_that_have_many_pasts_are_no_reason():
+    """Every particle starts at 0, and few fit what is seen at first."""
+    model = ScalarLinear(a=1.0, q=1.0, r=0.02, m=0.0, p=0.0)
     observations = np.cumsum(np.random.default_rng(1).normal(size=20)).astype(np.float32)
-    filter = mpfjax.particle_filter(Known(), 300)
+    filter = mpfjax.particle_filter(model, 300)
     run = mpfjax.run_filter(jax.random.key(0), filter, observations)
     with warnings.catch_warnings(action="error", category=RuntimeWarning):
         paths = sample_trajectories(jax.random.key(1), filter, run, 1000)
     assert min(len(np.unique(column)) for column in np.asarray(paths).T[1:]) < 20
+
+
+def test_no_lag_is_filtering_and_counts_are_averaged():
+    """An event has the variance p (1 - p)."""
+    filter = mpfjax.particle_filter(QUADRATIC, 50, ess_threshold=0.5)
+    smoother = FixedLagSmoother(filter, lambda before, after: after > 1, 0)
+    window = smoother.init(filter.init(jax.random.key(4)))
+    for key, seen in zip(jax.random.split(jax.random.key(5), 4), SQUARES, strict=True):
+        window, (found,), _ = smoother.step(key, window, seen)
+        moved = window.mixture
+        np.testing.assert_allclose(found, moved.expectation(moved.particles > 1), rtol=1e-5)
+        np.testing.assert_allclose(smoother.variances(window), [found * (1 - found)], atol=1e-5)
+
+
+@pytest.mark.exactness
+@pytest.mark.parametrize("method", ["exact", *weekly(["mcmc"])])
+def test_variances_are_about_the_mean_however_far_from_zero(method):
+    """As those of a Kalman smoother, where E[x²] - E[x]² is rounding alone."""
+    noise = np.random.default_rng(0).normal(size=(2, 12))
+    walk = np.cumsum(0.02 * noise[0])[:, None]
+    near, far = (
+        mpfjax.LinearGaussianModel([[1.0]], [[4e-4]], [[1.0]], [[9e-4]], [place], [[9e-4]])
+        for place in (0.0, 20.0)
+    )
+    seen = (walk + 0.03 * noise[1][:, None]).astype(np.float32)
+
+    def moments(model, place):
+        """The terms at the end, and their variances."""
+        filter = mpfjax.particle_filter(model, 300)
+        smoother = FixedLagSmoother(filter, lambda x, y: {"x": y, "xx": y**2}, 11, method)
+        window = smoother.init(filter.init(jax.random.key(0)))
+        for key, y in zip(jax.random.split(jax.random.key(1), 12), seen + place, strict=True):
+            window, terms, _ = smoother.step(key, window, y)
+        return terms, smoother.variances(window)["x"]
+
+    (terms, at_zero), (_, away) = moments(near, 0.0), moments(far, 20.0)
+    np.testing.assert_allclose(at_zero, terms["xx"] - terms["x"] ** 2, rtol=1e-3)
+    exact = mpfjax.exact.kalman_smoother(near, seen).covariances[-12:, 0]
+    np.testing.assert_allclose(away, exact, rtol=0.35)
+    np.testing.assert_allclose(np.mean(away / exact), 1, atol=0.1)
+
+
+LINEAR = mpfjax.LinearGaussianModel(
+    A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]]
+)
+SEEN = jnp.array([[0.8], [0.1], [-0.4]])
+NUM_STEPS = 3
+
+
+class ObservedDrift(DriftOfOne):
+    """With draws of its observations."""
+
+    def sample_observation(self, key, state):
+        return state[0] + jax.random.normal(key)
+
+
+def test_a_wrapped_models_observations_are_drawn_one_by_one():
+    """Of one particle, as all methods of such a model are, each with noise of its own."""
+    filter = mpfjax.particle_filter(mpfjax.per_particle(ObservedDrift()), 400)
+    mixture = filter.init(jax.random.key(0))
+    ahead = forecast(jax.random.key(1), filter, mixture, 2)
+    noise = ahead.observations - ahead.mixtures.particles[..., 0]
+    assert noise.shape == (2, 400)
+    np.testing.assert_allclose(noise.std(axis=1), 1.0, atol=4 / np.sqrt(2 * 400))
+
+
+@pytest.mark.exactness
+def test_predictions_are_the_kalman_filters():
+    """Of states and observations before each observation, and later ones; weights are unequal."""
+    seen, filter = SEEN.at[-1].set(1.5), mpfjax.particle_filter(LINEAR, 20_000)
+    run = mpfjax.run_filter(jax.random.key(1), filter, seen)
+    each_step = mpfjax.one_step_predictions(jax.random.key(2), filter, run)
+    later = forecast(jax.random.key(3), filter, run.final, NUM_STEPS)
+    unknown = jnp.concatenate([seen, jnp.full((NUM_STEPS, 1), jnp.nan)])
+    exact = kalman_filter(LINEAR, mpfjax.Series.skipping(unknown))
+    before = jnp.concatenate([jnp.array([0.5]), exact.means[:-1, 0]])
+    spread = 0.81 * jnp.concatenate([jnp.ones(1), exact.covariances[:-1, 0, 0]]) + 0.3
+    ahead = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), each_step, later)
+    moments = jax.vmap(lambda mixture, x: (mixture.expectation(x)[0], mixture.variance(x)[0]))
+    size = run.effective_sample_size.min()
+    for values, noise in ((ahead.mixtures.particles, 0.0), (ahead.observations, 0.4)):
+        mean, variance = moments(ahead.mixtures, values)
+        error = np.sqrt((spread + noise) / size)
+        assert np.all(np.abs(mean - 0.9 * before) < 4 * error)
+        np.testing.assert_allclose(variance, spread + noise, rtol=4 * np.sqrt(2 / size))
+    with pytest.raises(ValueError, match="run: it has not the mixtures of one run"):
+        mpfjax.one_step_predictions(jax.random.key(2), filter, replace(run, collected=None))
