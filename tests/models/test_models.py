@@ -60,7 +60,9 @@ def test_series_of_one_particle_and_with_inputs():
     assert noise.std() == pytest.approx(0.7, abs=4 * 0.7 / np.sqrt(400))
     states, _ = mpfjax.simulate(KEYS[2], Driven(), 4, inputs=jnp.arange(4.0))
     np.testing.assert_allclose(np.diff(states[:, 0]), np.arange(4.0), atol=1e-6)
-    with pytest.raises(TypeError, match=r"model: Driven\.\w+.*its inputs None, as the call"):
+    with pytest.raises(
+        TypeError, match=r"model: Driven\.\w+.*whose `inputs` is None: pass inputs="
+    ):
         mpfjax.simulate(KEYS[2], Driven(), 4)
 
 
