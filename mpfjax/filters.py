@@ -38,7 +38,6 @@ from mpfjax.transforms import (
 )
 
 Importance = Literal["propagated", "predictive_gaussian"]
-_PER_BIRTH, _UNDETECTED = 50, 400  # particles of an object, and of those not detected yet
 # K-means starts from the components of a few steps before, and needs few iterations.
 _WARM_ITERATIONS, _ITERATIONS = 2, 5
 
@@ -279,16 +278,17 @@ def bernoulli_filter(
     max_targets: Count,
     *,
     proposal: AbstractProposal | None = None,
+    particles_per_birth: Count = 50,
+    undetected_particles: Count = 400,
 ) -> Filter:
     """An unknown number of objects that appear and disappear: predict, associate.
 
     A particle implementation of the Poisson multi-Bernoulli filter (Williams 2015): each of
     `max_targets` components is a potential object with its own existence probability, and one more
     component represents the intensity of undetected objects. `estimate_targets` summarises the
-    objects. `Associate` describes the algorithm: 50 particles for a new object, and 400 for
-    undetected ones.
+    objects. `Associate` describes the algorithm and the last two arguments.
 
-    - `num_particles`: in total: those of undetected objects, and a hundred or more per object.
+    - `num_particles`: in total: `undetected_particles`, and a hundred or more per object.
     - `max_targets`: more than the number of measurements per scan if objects may appear anywhere.
 
     Each object is redrawn from its Gaussian, for which a few particles are sufficient. If
@@ -298,7 +298,7 @@ def bernoulli_filter(
     is known. For a single object use a filter with `ClutteredModel`, for boxes in a video
     `vision.ObjectTracker`.
     """
-    associate = Associate(_PER_BIRTH, _UNDETECTED, RegenerateObjects())
+    associate = Associate(particles_per_birth, undetected_particles, RegenerateObjects())
     return Filter(model, [Predict(proposal), associate], num_particles, max_targets + 1)
 
 

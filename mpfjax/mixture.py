@@ -120,13 +120,13 @@ class ParticleMixture(eqx.Module):
     component_indicators: Int[Array, " n"]
     ancestor_indices: Int[Array, " n"]
     num_components: int = eqx.field(static=True)
-    memory: dict[str, PyTree]
-    usable_slots: Int[Array, ""] | None
-    log_scale: Float[Array, ""]
-    t: Int[Array, ""]
-    within: Within | None
-    waits: Bool[Array, ""] | None
-    periods: PyTree
+    memory: dict[str, PyTree] = eqx.field(default_factory=dict)
+    usable_slots: Int[Array, ""] | None = None
+    log_scale: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), default_float()))
+    t: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), jnp.int32))
+    within: Within | None = None
+    waits: Bool[Array, ""] | None = None
+    periods: PyTree = None
 
     @property
     def num_particles(self) -> int:
@@ -484,13 +484,6 @@ def single_component(particles: PyTree, num_components: int = 1) -> ParticleMixt
         component_indicators=jnp.zeros(num_slots, jnp.int32),
         ancestor_indices=jnp.arange(num_slots, dtype=jnp.int32),
         num_components=num_components,
-        memory={},
-        usable_slots=None,
-        log_scale=jnp.zeros((), default_float()),
-        t=jnp.zeros((), jnp.int32),
-        within=None,
-        waits=None,
-        periods=None,
     )
 
 

@@ -23,7 +23,6 @@ from mpfjax import (
     Split,
 )
 from mpfjax.moves.propagation.propagate import Predict, Reweight
-from mpfjax.moves.resampling.gaussian import RegenerateObjects
 
 N, M = 40, 2
 
@@ -74,8 +73,8 @@ RECIPES: dict[str, Callable[[Any], Filter]] = {
     "distributed, evidence": recipe("distributed_partitioned_sampling", reassembly="evidence"),
     "independent": recipe("independent_particle_filters"),
     "clustered": recipe("clustered_particle_filter"),
-    "Bernoulli": lambda model: Filter(
-        model, [Predict(), mpfjax.Associate(100, 200, RegenerateObjects())], 400, 3
+    "Bernoulli": lambda model: mpfjax.bernoulli_filter(
+        model, 400, 2, particles_per_birth=100, undetected_particles=200
     ),
 }
 TRANSFORMS: dict[str, Callable[[Filter], Filter]] = {
