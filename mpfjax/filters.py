@@ -173,6 +173,7 @@ def gaussian_mixture_particle_filter(
     importance: Importance = "propagated",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
+    regroup: Sequence[AbstractMove] | None = None,
     regroup_every: Count = 1,
 ) -> Filter:
     """GM-MPF: redraw each component from the Gaussian of its moments, propagate, regroup.
@@ -196,7 +197,7 @@ def gaussian_mixture_particle_filter(
         model, num_particles, proposal=proposal, regeneration=regeneration, importance=importance
     )
     options = _grouping_options(model, features, scale)
-    return _mixture(plain, max_components, options, _ITERATIONS, None, regroup_every)
+    return _mixture(plain, max_components, options, _ITERATIONS, regroup, regroup_every)
 
 
 @checked
