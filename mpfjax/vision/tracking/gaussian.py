@@ -3,7 +3,7 @@
 A box has the coordinates (x, y, log w, log h) in pixels, a point (x, y) in deviations of its error.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -15,8 +15,9 @@ from mpfjax.vision.tracking.pairs import Pairs, intervals
 _GROWTH_KEPT = 0.9
 _STILL = np.zeros(2)
 _FURTHER = np.log(20)  # a distance beyond which one in twenty is, as -log of its probability
-# A number for each object and coordinate, or fewer that broadcast to these.
-Numbers = Float[np.ndarray, "*#n #k"]
+# A number for each object and coordinate, or fewer that broadcast to these; of NumPy, or of JAX
+# in a filter whose particles are such moments.
+Numbers = Float[Any, "*#n #k"]
 
 
 class Gaussian(NamedTuple):
@@ -67,9 +68,7 @@ class Gaussian(NamedTuple):
             self.var_velocity + frames * (unit * velocity_noise) ** 2,
         )
 
-    def update(
-        self, detected: Numbers, errors: Numbers
-    ) -> tuple["Gaussian", Float[np.ndarray, "*n k"], Float[np.ndarray, "*n k"]]:
+    def update(self, detected: Numbers, errors: Numbers) -> tuple["Gaussian", Numbers, Numbers]:
         """Kalman's update by a detection: the posterior, the innovations and their variances."""
         variance = self.var_place + errors**2
         gap = detected - self.place
@@ -83,7 +82,7 @@ class Gaussian(NamedTuple):
         )
         return posterior, gap, variance
 
-    def mix(self, other: "Gaussian", share: Float[np.ndarray, "*n #4"]) -> "Gaussian":
+    def mix(self, other: "Gaussian", share: Float[Any, "*n #4"]) -> "Gaussian":
         """The moments of a mixture of this Gaussian, with weight `share`, and the other."""
         away, away_velocity = self.place - other.place, self.velocity - other.velocity
         means = (share * a + (1 - share) * b for a, b in zip(self, other, strict=True))
