@@ -89,7 +89,7 @@ def test_evidence_and_moments_are_unbiased(chain):
     log_evidence = np.cumsum(run.log_likelihood_increments, axis=1)
     ratios = np.exp(log_evidence - exact.log_evidence)
     first, second = run.collected
-    assert_unbiased(ratios, loosest=0.03)
+    assert_unbiased(ratios, loosest=0.045)
     assert_unbiased(ratios[..., None] * first, exact.first)
     assert_unbiased(ratios[..., None] * second, exact.second)
     np.testing.assert_allclose(run.log_marginal_likelihood, log_evidence[:, -1], rtol=1e-4)
