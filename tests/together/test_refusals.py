@@ -348,8 +348,8 @@ REFUSED = (
     ("moves: .* never weigh the particles", lambda: Filter(MODEL, [Resample(), Predict()], 4)),
     ("scale: 2 units for 1 features",
      lambda: mpfjax.mixture_particle_filter(MODEL, 20, 2, scale=[1.0, 2.0]).init(KEY)),
-    ("group: groups have no effect",
-     lambda: Resample(particles_per_component=2, group=nothing)),
+    ("allocation: particles_per_component leaves no slots",
+     lambda: Resample(particles_per_component=2, allocation=nothing)),
     ("moves: (?s:.*) neither regroups, resamples nor",
      lambda: mpfjax.Every(2, [KMeans(), Propagate()])),
     ("moves: two of them use the memory 'every 2: KMeans', as Every", lambda: FILTER.replace(

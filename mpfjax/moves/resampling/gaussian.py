@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
@@ -15,15 +15,11 @@ from mpfjax.models.law import refuse_marginalised
 from mpfjax.models.noise import draw_noise
 from mpfjax.moves.base import AbstractResampling, Step
 from mpfjax.moves.regrouping.features import origin, summarise
-from mpfjax.moves.resampling.allocation import allocate_slots
-from mpfjax.moves.resampling.line import Line, sorted_order
+from mpfjax.moves.resampling.line import sorted_order
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.logarithms import scaled_exp
 from mpfjax.operations.matrices import cholesky
 from mpfjax.operations.random import split
 from mpfjax.operations.segments import spread
-
-_POWER = 0.25  # of an object's weight, by which it receives slots
 
 
 class GaussianRegeneration(AbstractResampling):
@@ -126,34 +122,19 @@ class GaussianRegeneration(AbstractResampling):
         return jax.vmap(unravel)(centre[None] + means + offsets)
 
 
-class _ByRoot(Resample):
-    """Slots in proportion to the fourth root of the weights.
-
-    An object that exists receives some ten times as many as a false measurement, which begins one
-    of 1e-4, and this still has enough for its moments.
-    """
-
-    def deal(
-        self, mixture: ParticleMixture, line: Line, due: Bool[Array, " m"]
-    ) -> Int[Array, " m"]:
-        """How many slots each component receives."""
-        demands, _ = scaled_exp(jnp.where(due, _POWER * line.log_masses, -jnp.inf))
-        unchanged = jnp.zeros_like(due, jnp.int32)
-        each = self.particles_per_component
-        return allocate_slots(unchanged, due, mixture.num_usable_slots, each, demands)
-
-
 class RegenerateObjects(GaussianRegeneration):
     """`GaussianRegeneration` for the many components of a `bernoulli_filter`.
 
     Σ_m is the unbiased estimate, that of the paper divided by 1 - Σ w_i². With fifty particles for
     each object, the paper's Σ_m shrinks by some percent in each step, so that the filter becomes
-    overconfident. Components receive slots in proportion to the fourth root of their weight.
+    overconfident. The allocation is "root": an object that exists receives some ten times as many
+    slots as a false measurement, which begins one of 1e-4, and this still has enough for its
+    moments.
     """
 
     @property
     def _resample(self) -> Resample:
-        return _ByRoot(particles_per_component=self.particles_per_component)
+        return Resample(particles_per_component=self.particles_per_component, allocation="root")
 
     def _correct(
         self, covariances: Float[Array, "m d d"], mixture: ParticleMixture
