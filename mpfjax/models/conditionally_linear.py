@@ -72,9 +72,9 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
 
     An entry of y_t that is NaN is missing, and `log_likelihood` must omit it as well. A class with
     `handles_missing = False` never receives one. `particle_filter`, `mixture_particle_filter` and
-    `auxiliary_particle_filter` accept such a model like any other: their move is
-    `PropagateMarginalised`. Use it if a part of the state is linear given the rest: regimes,
-    velocities and biases in addition to a position, maps.
+    `auxiliary_particle_filter` accept such a model like any other: their move is `Propagate`. Use
+    it if a part of the state is linear given the rest: regimes, velocities and biases in addition
+    to a position, maps.
     """
 
     handles_missing = True

@@ -129,7 +129,7 @@ def law_of(model: Any) -> Law:
 
 
 def refuse_marginalised(
-    model: Any, needed_by: str, instead: str = "take PropagateMarginalised", name: str = "model"
+    model: Any, needed_by: str, instead: str = "take Propagate", name: str = "model"
 ) -> None:
     """Raise a `ValueError` for a model that is not propagated as a whole."""
     if not law_of(model).is_whole:

@@ -86,11 +86,24 @@ class Propagate(Draw, AbstractPropagationOfEach):
     and the factor is L alone. With a proposal it is the guided filter. Use one if the likelihood is
     much narrower than the dynamics.
 
+    For an `AbstractConditionallyLinearModel`, where it is also called `PropagateMarginalised`, it
+    is the step of a Rao-Blackwellised particle filter, or mixture Kalman filter (Chen and Liu 2000;
+    Doucet, de Freitas, Murphy and Russell 2000). Each particle (z, m, P) draws z_t, its Kalman
+    filter predicts x_t, and the weight is multiplied by
+
+        p(y_t | z_0, ..., z_t, y_1..y_{t-1}) = N(y_t; H m + c, H P Hᵀ + R)
+
+    and by the likelihood of observations of z_t alone. Then the Kalman filter is updated, in
+    Joseph's form, which keeps P positive in float32. In the mixed form, z_t is drawn from its
+    distribution given y_1..y_{t-1}, N(f + A m, A P Aᵀ + V), and first updates x_{t-1}.
+
+    - `proposal`: q, an `AbstractProposal`. For a conditionally linear model it proposes z_t, such
+      as `RegimeProposal()`, from the particles (latent, mean, covariance) of t - 1.
     - `gradient`: what is differentiated; the values are the same. "none" differentiates the draw
       x_t = f(x_{t-1}, noise; θ). "stop" treats the draw as a constant and the factor as L D / ⊥q,
       where ⊥ is `stop_gradient` (Ścibior and Wood 2021). Parameters of D then have a gradient
-      through its density, and parameters of q have none. The draw of x_0 is differentiated in both
-      cases.
+      through its density, and parameters of q have none. The draw of x_0, and the moments of a
+      conditionally linear model, are differentiated in both cases.
     - `noise`: the noise of x_t. "independent": each particle has independent noise, drawn by the
       model's `sample_transition` or by the proposal. "rqmc" distributes the noise evenly over the
       slots of each component. The distribution of every single particle does not change, so Ẑ
