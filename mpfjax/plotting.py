@@ -62,7 +62,7 @@ def draw_components(
 @checked
 def draw_plane(
     run: FilterRun | ParticleMixture,
-    indices: tuple[int, int] = (0, 1),
+    indices: tuple[int, int],
     *,
     truth: np.ndarray | None = None,
     ax: Axes | None = None,
