@@ -64,7 +64,7 @@ BUGS = {
     "islands forget each other's scale": Bug(
         "log_total = log_sum_exp(sums + (((scales - common) + largest) - shift))",
         "log_total = log_sum_exp(sums)",
-        "tests/running/test_devices.py -k unbiased",
+        "tests/matrix/test_matrix.py -k particle-islands",
     ),
     "a resumed study runs finished cells again": Bug(
         "pending = [cell for cell in cells if cell.file not in results]",
@@ -112,7 +112,7 @@ BUGS = {
     "a start forgets p(x_0)": Bug(
         "log_prior = log_prior.astype(default_float())",
         "log_prior = 0 * log_prior.astype(default_float())",
-        "tests/moves/start/test_sampler.py -k unbiased",
+        "tests/moves/start/test_restart.py -k beyond",
     ),
     "restarts forget the evidence of the old hypotheses": Bug(
         "log_odds = jnp.sum(increments - replaced)",
@@ -128,7 +128,7 @@ BUGS = {
     "backward sampling forgets the next state": Bug(
         "log_weights = mixture.log_weights + log_density(future)",
         "log_weights = mixture.log_weights + 0 * log_density(future)",
-        "tests/smoothing/test_contracts.py -k 'exact_ones and backward'",
+        "tests/matrix/test_matrix.py -k particle-trajectories",
     ),
     "the variance of log Ẑ counts pairs for less": Bug(
         "grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)",
@@ -139,7 +139,7 @@ BUGS = {
     "posteriors leave out the Jacobian": Bug(
         "volumes = (self.transforms[name].log_jacobian(u) for name, u in reals.items())",
         "volumes = (0 * self.transforms[name].log_jacobian(u) for name, u in reals.items())",
-        "tests/tuning/test_posteriors.py -k by_metropolis",
+        "tests/tuning/test_metropolis.py -k log_density",
     ),
     # Models, exact answers and inputs.
     "the smoother goes back by the filter's covariance": Bug(

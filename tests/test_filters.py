@@ -39,13 +39,6 @@ def test_one_component_is_the_particle_filter_to_the_bit():
 
 
 @pytest.mark.exactness
-def test_a_start_is_what_its_parts_give_one_after_the_other():
-    """To the last digit: the draws of x_0 are not part of the program that groups them."""
-    filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(), 60, max_components=3)
-    chex.assert_trees_all_equal(filter.init(KEY), filter._init(KEY))
-
-
-@pytest.mark.exactness
 def test_the_mass_of_a_mixture_given_by_hand_counts_once_whatever_moves_leave_the_weights():
     """A move that returns the weights that it was given is not normalised again."""
 

@@ -105,7 +105,7 @@ MOVES: dict[str, Callable[[Any], Filter]] = {
     "Pool": chain(Resample(), Propagate(), Pool()),
     "GroupBy": chain(Resample(), Propagate(), mpfjax.GroupBy(side)),
     "Every": chain(Every(2, [Resample()]), Propagate()),
-    "IslandInteraction": chain(mpfjax.IslandInteraction(), Resample(), Propagate()),
+    "IslandInteraction": chain(mpfjax.IslandInteraction(1.0), Resample(), Propagate()),
     "Exclusion": chain(Resample(), Propagate(), mpfjax.Exclusion(strength=1.0, radius=0.5)),
     "own function": lambda model: Filter(model, [Resample(), Propagate(), identity], N),
     "initially Gaussian": lambda model: Filter(

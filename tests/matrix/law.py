@@ -36,6 +36,8 @@ class Answer(NamedTuple):
     variances: np.ndarray
     smoothed: np.ndarray
     """E[x_s | y_1..y_t], (t + 1,)."""
+    pairs: np.ndarray
+    """E[x_{s-1} x_s | y_1..y_t], (t,)."""
     ahead: tuple[float, float]
     """the mean and the variance of x_{t+1}, with u_{t+1} = 1 where there are inputs."""
 
@@ -58,11 +60,15 @@ def kalman(law, y, u):
             m, p = m + p / s * gap, p * r**2 / s
         increments.append(increment)
         filtered.append((m, p))
-    smoothed = [m]
+    smoothed, spread, pairs = [m], p, []
     for (m_s, p_s), (m_p, p_p) in zip(filtered[-2::-1], predicted[::-1], strict=True):
-        smoothed.append(m_s + a * p_s / p_p * (smoothed[-1] - m_p))
+        gain, later = a * p_s / p_p, smoothed[-1]
+        smoothed.append(m_s + gain * (later - m_p))
+        pairs.append(smoothed[-1] * later + gain * spread)
+        spread = p_s + gain**2 * (spread - p_p)
+    backward = np.array(smoothed[::-1]), np.array(pairs[::-1])
     ahead = a * m + b * float(np.any(u)), a**2 * p + q**2
-    return Answer(np.array(increments), *np.array(filtered).T, np.array(smoothed[::-1]), ahead)
+    return Answer(np.array(increments), *np.array(filtered).T, *backward, ahead)
 
 
 def score(law, y, u, name, answer=kalman):
@@ -112,13 +118,15 @@ def enumerated(law, y, u):
             share = share * likelihood / (share @ likelihood)
         increments.append(increment)
         rows.append(share)
-    backward = [share]
+    smoothed, pairs = [share], []
     for before in rows[-2::-1]:
         joint = before[:, None] * matrix
-        weights = joint / joint.sum(axis=0, where=True)[None]
-        backward.append(weights @ backward[-1])
+        joint *= smoothed[-1] / joint.sum(axis=0)
+        smoothed.append(joint.sum(axis=1))
+        pairs.append(states @ joint @ states)
+    backward = np.array(smoothed[::-1]) @ states, np.array(pairs[::-1])
     means = np.array(rows) @ states
     variances = np.array(rows) @ states**2 - means**2
     last = share @ matrix
     ahead = last @ states, last @ states**2 - (last @ states) ** 2
-    return Answer(np.array(increments), means, variances, np.array(backward[::-1]) @ states, ahead)
+    return Answer(np.array(increments), means, variances, *backward, ahead)

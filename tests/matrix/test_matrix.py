@@ -99,6 +99,14 @@ def test_questions_of_forms(form, question):
     check(form, "particle", cells(GAPS, [question]))
 
 
+SMOOTHERS = ("trajectories", "trajectories, mcmc", "sums", "sums, mcmc", "fixed lag", "genealogy")
+
+
+@pytest.mark.parametrize("question", quick_of(SMOOTHERS, [], one_in=3))
+def test_smoothers_after_a_step_without_likelihood(question):
+    check("made of noise", "particle", cells(("zero likelihood",), [question]))
+
+
 TAKEN = ("inputs", "one of several", "targets", "switching")
 OF_FILTERS = [(filter, question) for question in OTHERS for filter in SINGLES]
 

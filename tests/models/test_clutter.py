@@ -146,15 +146,3 @@ def test_chances_of_nothing_and_of_all_have_derivatives():
     for p in (0.0, 0.4, 1.0):
         expected = (ratio - 1) / (1 - p + p * ratio)
         np.testing.assert_allclose(jax.grad(log_likelihood)(p), expected, rtol=1e-4)
-
-
-def test_what_needs_a_single_measurement_is_refused():
-    for missing, make in (
-        (
-            "observation_mean",
-            lambda: mpfjax.particle_filter(MODEL, 4, proposal=mpfjax.GaussNewtonProposal()),
-        ),
-        ("sample_observation", lambda: mpfjax.simulate(KEY, MODEL, 2)),
-    ):
-        with pytest.raises(ValueError, match=f"ClutteredModel.* {missing}"):
-            make()

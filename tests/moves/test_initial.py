@@ -10,7 +10,6 @@ import pytest
 import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.initial import SelectInitial, selection_weights
-from mpfjax.smoothing import conditional_filter
 from tests.moves.start.test_sampler import PLACES, WithKeys
 from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import ScalarLinear
@@ -55,18 +54,6 @@ def test_evidence_and_moments_stay_unbiased_and_vary_less(runs):
     assert_unbiased(ratios * means, exact().means[-1, 0])
 
 
-def test_the_chosen_particles_represent_the_prior(runs):
-    initial = runs[8].initial
-    np.testing.assert_allclose(jax.vmap(lambda m: m.weights.sum())(initial), 1.0, atol=1e-5)
-    # More of them are near the observation than of plain draws, and weigh less.
-    near = np.abs(initial.particles - 3.0) < 0.5
-    assert near.mean() > 5 * np.mean(np.abs(runs[1].initial.particles - 3.0) < 0.5)
-    weights = np.asarray(jax.vmap(lambda m: m.weights)(initial))
-    weights = weights * np.exp(initial.log_scale)[:, None]
-    for function, mean in ((near, 0.01325), (initial.particles > 0, 0.5), (weights > 0, 1.0)):
-        assert_unbiased(np.sum(weights * np.asarray(function), axis=1), mean)
-
-
 @pytest.mark.exactness
 def test_without_an_observation_it_does_nothing():
     gap = OBSERVATIONS.copy()
@@ -97,16 +84,6 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
     log_z = -0.5 * (seen @ np.linalg.solve(covariance, seen) + np.linalg.slogdet(covariance)[1])
     log_z -= np.log(2 * np.pi)
     assert_unbiased(ratios_to(log_z, found))
-
-
-@pytest.mark.exactness
-def test_where_x_0_must_be_a_plain_draw_it_is_one():
-    trajectory = np.full(4, 3.0, np.float32)
-    found = conditional_filter(KEY, make(8), OBSERVATIONS, trajectory)
-    same = conditional_filter(KEY, make(1), OBSERVATIONS, trajectory)
-    np.testing.assert_array_equal(found.trajectory, same.trajectory)
-    chosen = make(8, scheme="multinomial")
-    assert not mpfjax.with_eve_indices(chosen).weighs_initially
 
 
 @pytest.mark.exactness

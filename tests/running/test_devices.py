@@ -14,7 +14,6 @@ import pytest
 
 import mpfjax
 import mpfjax.running.run
-from mpfjax.exact import grid_filter
 from mpfjax.operations import compiling
 from mpfjax.operations.compiling import cpu_options, in_little_memory
 from mpfjax.operations.islands import DEVICE_AXIS, ISLAND_AXIS
@@ -24,7 +23,6 @@ from mpfjax.running.islands import IslandInteraction
 from tests import on_devices
 from tests.examples import AT_START, make_mixture
 from tests.precision import float64
-from tests.unbiased import assert_unbiased
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 MODEL = on_devices.quadratic()
@@ -62,29 +60,7 @@ class Cliff(mpfjax.QuadraticModel):
         return jnp.where(near, 0.0, -jnp.inf)
 
 
-def exchanging(model):
-    """A mixture on islands that exchange particles last but for K-means."""
-    exchange = IslandInteraction(0.9)
-    moves = [mpfjax.Resample(), mpfjax.Propagate(), exchange, mpfjax.KMeans(2)]
-    return mpfjax.Filter(model, moves, 12, 2, [mpfjax.KMeans(2, reseed=True)])
-
-
-EXCHANGING = exchanging(MODEL)
-
-
 class TestIslands:
-    @pytest.mark.exactness
-    def test_evidence_and_means_are_unbiased(self):
-        keys = jax.random.split(jax.random.key(3), 1500)
-        run = jax.jit(jax.vmap(
-            lambda key: mpfjax.run_islands(key, EXCHANGING, OBSERVATIONS, mean, num_islands=4)
-        ))(keys)  # fmt: skip
-        exact = grid_filter(MODEL, OBSERVATIONS, jnp.linspace(-5.0, 5.0, 1001))
-        log_ratios = run.log_likelihood_increments - exact.log_likelihood_increments[None]
-        ratios = np.exp(np.cumsum(log_ratios, axis=1))
-        assert_unbiased(ratios, loosest=0.03)
-        assert_unbiased(ratios * np.asarray(run.collected.sum(axis=2)), exact.means)
-
     @pytest.mark.exactness
     def test_an_exchange_revives_islands_without_any_likelihood(self):
         """And a missing observation is skipped."""

@@ -13,7 +13,13 @@ from jax.scipy.stats import norm
 import mpfjax
 from mpfjax import forecast
 from mpfjax.exact import kalman_filter
-from mpfjax.smoothing import FixedLagSmoother, backward, sample_trajectories, trace_ancestors
+from mpfjax.smoothing import (
+    FixedLagSmoother,
+    backward,
+    sample_trajectories,
+    smoothed_sums,
+    trace_ancestors,
+)
 from tests.marking import weekly
 from tests.user_models import Batched, DriftOfOne, ScalarLinear
 
@@ -86,20 +92,17 @@ def test_a_genealogy_is_that_of_a_loop():
             indices = ancestors[t - 1][indices]
 
 
-@pytest.mark.exactness
-def test_what_follows_ancestors_refuses_particles_without_one_parent():
-    filter, seen = mpfjax.gaussian_particle_filter(QUADRATIC, 50), jnp.full(3, 1.5)
-    run = mpfjax.run_filter(jax.random.key(0), filter, seen)
-    assert (run.collected.ancestor_indices == -1).all()
-    key = jax.random.key(1)
-    for follow, named in (
-        (lambda run: trace_ancestors(run), "trace_ancestors follows"),
-        (lambda run: sample_trajectories(key, filter, run, 9, method="mcmc"), "method 'mcmc'"),
+@pytest.mark.parametrize("observations", [[np.nan] * 3, [1.0]], ids=["nothing seen", "one step"])
+def test_smoothers_of_no_observation_and_of_one_step(observations):
+    filter, key = mpfjax.particle_filter(QUADRATIC, 20), jax.random.key(1)
+    series = mpfjax.Series.skipping(np.float32(observations))
+    run = mpfjax.run_filter(key, filter, series)
+    for found in (
+        trace_ancestors(run).trajectories,
+        *(sample_trajectories(key, filter, run, 4, method=name) for name in ("exact", "mcmc")),
+        smoothed_sums(key, filter, series, lambda before, now: before * now).sums,
     ):
-        with pytest.raises(ValueError, match=f"mixtures: .*{named}"):
-            follow(run)
-        paths = jax.jit(follow)(run)
-        assert np.isnan(getattr(paths, "trajectories", paths)).all()
+        assert np.isfinite(found).all()
 
 
 class Bounded(Batched):

@@ -1,4 +1,4 @@
-"""In float64 every filter and smoother of the registries runs, and nothing falls back to float32.
+"""In float64 filters and smoothers of every kind run, and nothing falls back to float32.
 
 Types are settled as a program is traced, so most are traced and no more.
 """
@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import mpfjax
+from mpfjax import smoothing
 from mpfjax.models.series import Series
 from mpfjax.running.scan import scan
 from tests.marking import quick_of
 from tests.precision import float64
 from tests.registry import CHAINS, QUICK_CHAINS
-from tests.smoothing.registry import SMOOTHERS
 
 KEY = jax.random.key(0)
 SQUARES = np.array([1.5, 1.0, np.nan, 0.9])
@@ -47,18 +47,35 @@ def test_chains_of_each_kind_are_traced(chain):
     assert_double(eqx.filter_eval_shape(lambda key: scan(key, filter, series, None), KEY))
 
 
-# One of each form by default.
+def product(before, now):
+    return before * now
+
+
+SMOOTHERS = {
+    "genealogy": lambda filter, run: smoothing.trace_ancestors(run),
+    "backward sampling": lambda filter, run: smoothing.sample_trajectories(KEY, filter, run, 4),
+    "backward sampling, MCMC": lambda filter, run: smoothing.sample_trajectories(
+        KEY, filter, run, 4, method="mcmc"
+    ),
+    "PaRIS": lambda filter, run: smoothing.smoothed_sums(
+        KEY, filter, Series.skipping(SQUARES), product
+    ),
+    "conditional filter": lambda filter, run: smoothing.conditional_filter(
+        KEY, filter, Series.skipping(SQUARES), jnp.zeros(len(SQUARES) + 1)
+    ),
+}
 QUICK = ("backward sampling", "PaRIS", "conditional filter")
 
 
-@pytest.mark.parametrize("name", quick_of(SMOOTHERS, QUICK, one_in=3))
-def test_every_smoother_is_traced(name):
-    filter, trajectory = CHAINS["pf"](quadratic()), jnp.zeros(len(SQUARES) + 1)
+@pytest.mark.parametrize("name", quick_of(SMOOTHERS, QUICK, one_in=2))
+def test_smoothers_are_traced(name):
+    filter = CHAINS["pf"](quadratic())
 
-    def rows(key):
-        return SMOOTHERS[name].rows(key, filter, SQUARES, trajectory)
+    def smooth(key):
+        run = mpfjax.run_filter(key, filter, SQUARES, missing="skip")
+        return SMOOTHERS[name](filter, run)
 
-    assert_double(eqx.filter_eval_shape(rows, KEY))
+    assert_double(eqx.filter_eval_shape(smooth, KEY))
 
 
 class OfSingle(mpfjax.AbstractStateSpaceModel):

@@ -3,7 +3,6 @@
 That they are the score, the matrix asks.
 """
 
-import chex
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,36 +10,13 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax import Filter, Propagate, Resample, Step, with_score_gradient
-from mpfjax.moves.propagation.propagate import Predict
-from tests.examples import example_mixtures
+from mpfjax import Filter, Propagate, Resample, with_score_gradient
 from tests.marking import weekly
 from tests.user_models import BLINDED, ScalarLinear
 
 NUM_PARTICLES = 48
 MODEL = ScalarLinear()
 ONE = jnp.array([[1.5], [1.0], [0.4], [0.9]])
-
-
-MOVES = {
-    "resampling": lambda gradient: Resample(ess_threshold=0.5, gradient=gradient),
-    "bootstrap": lambda gradient: Propagate(gradient=gradient),
-    "guided": lambda gradient: Propagate(mpfjax.GaussNewtonProposal(), gradient=gradient),
-    "halves": lambda gradient: Predict(gradient=gradient),
-}
-
-
-@pytest.mark.parametrize("kind", MOVES)
-def test_moves_with_stopped_gradients_are_the_same_to_the_bit(kind):
-    now = Step(MODEL, ONE[0, 0])
-    for mixture in example_mixtures().values():
-        one_dimensional = mixture.replace(particles=mixture.particles[:, 0])
-        chex.assert_trees_all_equal(
-            *(
-                eqx.filter_jit(MOVES[kind](gradient))(jax.random.key(5), one_dimensional, now)
-                for gradient in ("none", "stop")
-            )
-        )
 
 
 class Window(mpfjax.QuadraticModel):

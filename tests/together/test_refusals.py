@@ -331,14 +331,13 @@ def around(filter=FILTER, trajectory=THREE):
 
 SCALAR = ScalarLinear()
 OF_SCALAR = mpfjax.particle_filter(SCALAR, 4)
-GAUSSIAN = mpfjax.gaussian_particle_filter(SCALAR, 4)
 ASCENT = optax.sgd(0.1)
 OF_A = {"parameters": {"a": lambda filter: filter.model.a}, "progress": False}
 
 
-def chain(filter=OF_SCALAR, **options):
+def chain(**options):
     options = {"log_prior": lambda parameters: 0.0} | OF_A | options
-    return tuning.metropolis_hastings(KEY, filter, TWO, 4, **options)
+    return tuning.metropolis_hastings(KEY, OF_SCALAR, TWO, 4, **options)
 
 
 def climb(**options):
@@ -363,12 +362,10 @@ REFUSED = (
         MODEL, 5, importance="predictive_gaussian", proposal=GUIDE)),
     ("num_slots: 3 is not at least N, 4",
      lambda: mpfjax.monte_carlo(KEY[None], FILTER, TWO, num_slots=3)),
-    *(
-        ("model: a TargetsModel, whose .* would leave out; it is for bernoulli_filter",
-         lambda make=make: make(mpfjax.TargetsModel(**TARGETS), 10))
-        for make in (mpfjax.particle_filter,
-                     lambda model, n: mpfjax.mixture_particle_filter(model, n, 2))
-    ),
+    ("2 steps, fewer than num_observations of with_initialisation, 3", lambda: run(
+        mpfjax.with_initialisation(FILTER, 3))),
+    ("ClutteredModel.* sample_observation",
+     lambda: mpfjax.simulate(KEY, mpfjax.ClutteredModel(**SENSOR), 2)),
     # observations
     (r"observations: shapes .* jnp.asarray\(observations\)", lambda: run(FILTER, [0.0, 1.0])),
     (r"observation: shape \(2,\)", lambda: run(FILTER, jnp.zeros((3, 2)))),
@@ -445,10 +442,6 @@ REFUSED = (
     ("settings: 'filter' is a name",
      lambda: mpfjax.Study(**GOOD[mpfjax.Study] | {"settings": {"filter": [1]}})),
     # propagation, several objects, look-ahead
-    ("Batched defines no log_transition, which gradient=",
-     lambda: Filter(Batched(), [Propagate(gradient="stop")], 4)),
-    ("Batched defines no transition_from_noise",
-     lambda: Filter(Batched(), [Propagate(noise="rqmc")], 4)),
     ("inherits its transition_from_noise, which noise='rqmc' needs",
      lambda: Filter(changed(Drift, sample_transition=lambda self, key, x: x),
                     [Propagate(noise="rqmc")], 4)),
@@ -479,16 +472,7 @@ REFUSED = (
     (r"mixtures: \[ParticleMixture\(particles=f32\[4\], .* is not", lambda: paths([MIXTURE])),
     (r"q: 90 is not in \[0, 1\]", lambda: MIXTURE.quantile(MIXTURE.particles, 90)),
     (r"trajectory: float32\[4\] is not float32\[3\]", lambda: around(trajectory=np.ones(4))),
-    *(
-        (f"filter: .*{words}", lambda filter=filter: around(filter))
-        for words, filter in (
-            ("needs noise='independent'", mpfjax.with_quasi_monte_carlo(FILTER)),
-            ("one Propagate or Predict", Filter(MODEL, [Reweight()], 4)),
-            ("PropagateNested cannot keep", mpfjax.with_proposals_per_particle(FILTER, 2)),
-            ("Partitioned cannot keep", mpfjax.partitioned_sampling(JOINT, 4)),
-            ("GaussianRegeneration cannot keep", GAUSSIAN),
-        )
-    ),
+    ("filter: .*one Propagate or Predict", lambda: around(Filter(MODEL, [Reweight()], 4))),
     (r"function: shape \(\) has no leading axis",
      lambda: smoothing.smoothed_sums(**FILTERED, function=lambda previous, states: states.sum())),
     ("filter: .* is approximate or draws in a way of its own", lambda:
@@ -499,7 +483,6 @@ REFUSED = (
     # tuning
     (r"num_samples: 800 .* num_moves \+ 1 = 6; use 798 or 804", lambda: tuning.smc2(
         KEY, OF_SCALAR, TWO, 800, sample_prior=nothing, log_prior=nothing, **OF_A)),
-    ("(?s)filter: .* none of its moves is approximate", lambda: chain(GAUSSIAN)),
     (r"proposal_deviations: those of \['b'\]", lambda: chain(proposal_deviations={"b": 1.0})),
     ("log_prior: -inf at the start", lambda: chain(log_prior=lambda p: 0 * p["a"] - jnp.inf)),
     (r"sample_prior: a of shape \(2,\)", lambda: chain(sample_prior=lambda key: {"a": TWO})),

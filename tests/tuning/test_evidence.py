@@ -52,19 +52,6 @@ def test_the_score_by_fishers_identity_is_exact_without_any_gradient_of_the_move
         assert abs(errors.mean()) < 4 * standard, n
 
 
-@pytest.mark.parametrize(
-    ("filter", "says"),
-    [
-        (lambda: mpfjax.particle_filter(ScalarLinear(), 4), "no log_initial, which score="),
-        (lambda: mpfjax.gaussian_particle_filter(Pushed(), 4), "GaussianRegeneration leaves no"),
-        (lambda: mpfjax.with_restarts(mpfjax.particle_filter(Pushed(), 4)), "filter: .* leaves no"),
-    ],
-)
-def test_fishers_identity_needs_parents_and_the_density_of_the_start(filter, says):
-    with pytest.raises(ValueError, match=says):
-        pose_evidence(filter(), SERIES, None, None, "fisher")
-
-
 def test_parameters_of_a_proposal_have_no_score_by_fishers_identity():
     proposal = mpfjax.NetworkProposal.create(KEY, 1, 1, 0.8)
     filter = mpfjax.particle_filter(Pushed(), 4, proposal=proposal)

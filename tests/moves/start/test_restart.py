@@ -1,9 +1,8 @@
-"""Starts and restarts: exact where the state is drawn anew, refused elsewhere; and the alarm."""
+"""Starts and restarts, exact where the state is drawn anew, and the alarm."""
 
 import warnings
 from functools import partial
 
-import chex
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,11 +13,11 @@ import scipy.stats
 import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.start.restart import Restart
-from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_sums
+from mpfjax.smoothing import smoothed_sums
 from tests.marking import weekly
 from tests.moves.start.test_sampler import PLANE, WithKeys
 from tests.unbiased import assert_unbiased, ratios_to
-from tests.user_models import Batched, ScalarLinear
+from tests.user_models import ScalarLinear
 
 KEY = jax.random.key(0)
 STEPS, LENGTH, PROBABILITY = 9, 3, 0.01
@@ -62,28 +61,6 @@ def test_evidence_and_moments_are_unbiased_beyond_the_window():
     ratios = ratios_to(exact, runs)
     assert_unbiased(ratios, loosest=0.05)
     assert_unbiased(ratios[:, None] * np.asarray(runs.collected)[:, -1], exact.means[-1])
-
-
-@pytest.mark.exactness
-def test_one_step_at_a_time_is_a_run_without_y_1_at_the_start():
-    """Restarts included, whose room for observations is made by the first step."""
-    run = mpfjax.run_filter(KEY, FILTER, CARRIED, mean)
-    key_start, key_steps = jax.random.split(KEY)
-    mixture = FILTER.init(key_start)
-    for t, key in enumerate(jax.random.split(key_steps, len(CARRIED))):
-        mixture, info = FILTER.step(key, mixture, CARRIED[t])
-        increment = run.log_likelihood_increments[t]
-        np.testing.assert_allclose(info.log_likelihood_increment, increment, rtol=1e-4, atol=1e-4)
-        np.testing.assert_allclose(mixture.mean(), run.collected[t], rtol=1e-3)
-        assert (np.asarray(mixture.ancestor_indices) == -2).all() == (t + 1 == LENGTH)
-
-
-def test_a_checkpoint_within_the_window_goes_on_to_the_bit(tmp_path):
-    mixture, _ = START.step(KEY, START.init(KEY, SEEN[0]), SEEN[0])
-    mpfjax.save_checkpoint(tmp_path / "first.npz", mixture)
-    loaded = mpfjax.load_checkpoint(tmp_path / "first.npz", like=mixture)
-    both = [START.step(KEY, each, SEEN[1])[0] for each in (mixture, loaded)]
-    chex.assert_trees_all_equal(*both)
 
 
 def log_evidence_with_a_restart(seen, carried, model=PLANE):
@@ -147,27 +124,11 @@ def test_restarts_where_log_likelihoods_are_large_or_minus_infinity(change):
     assert np.asarray(runs.degenerate).any() == ("reach" in change)
 
 
-def test_smoothing_refuses_a_run_in_which_a_state_began_anew():
-    for plain in (PLAIN, mpfjax.gaussian_particle_filter(WithDensity(), 100)):
-        filter = mpfjax.with_initialisation(plain, LENGTH)
-        run = mpfjax.run_filter(KEY, filter, SEEN)
-        with pytest.raises(ValueError, match="cannot be smoothed"):
-            sample_trajectories(KEY, filter, run, 5)
-    with pytest.raises(ValueError, match="one parent"):
-        mpfjax.with_eve_indices(START)
-    with pytest.raises(ValueError, match="cannot keep a trajectory"):
-        conditional_filter(KEY, FILTER, CARRIED, np.zeros((13, 2), np.float32))
-
-
 @pytest.mark.exactness
 def test_online_smoothing_ends_where_a_state_begins_anew():
-    """At a restart, or before the run where the state begins anew in any case."""
-    for filter, error, text in (
-        (restarts(PLAIN), RuntimeError, "restarts"),
-        (FILTER, ValueError, "cannot be smoothed"),
-    ):
-        with pytest.raises(error, match=text):
-            smoothed_sums(KEY, filter, CARRIED, lambda before, now: now[:, 0])
+    """Runs that begin anew in any case are refused before, as the matrix asks."""
+    with pytest.raises(RuntimeError, match="restarts"):
+        smoothed_sums(KEY, restarts(PLAIN), CARRIED, lambda before, now: now[:, 0])
 
 
 def test_derivatives_are_refused():
@@ -199,17 +160,6 @@ def test_an_alarm_begins_where_the_start_ends():
     assert not np.asarray(runs.alarm).any()
     against = np.asarray(runs.log_evidence_against_start)
     assert (against[:, LENGTH:].max(axis=1) < 0).all()
-
-
-def test_what_cannot_begin_so_is_refused():
-    with pytest.raises(ValueError, match="defines no log_initial"):
-        mpfjax.with_initialisation(mpfjax.particle_filter(Batched(), 50))
-    with pytest.raises(ValueError, match="initial_moves: SelectInitial does more than regroup"):
-        mpfjax.with_initial_selection(START)
-    with pytest.raises(
-        ValueError, match="2 steps, fewer than num_observations of with_initialisation, 3"
-    ):
-        mpfjax.run_filter(KEY, START, SEEN[:2], mean)
 
 
 MODEL = ScalarLinear()

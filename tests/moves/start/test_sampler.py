@@ -6,18 +6,15 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.exact import kalman_filter
-from mpfjax.moves.start.sampler import check_initial_density, sample_window
-from tests.moves.test_marginalised import MODEL as CONDITIONALLY_LINEAR
+from mpfjax.moves.start.sampler import sample_window
 from tests.unbiased import assert_unbiased
 
 KEY = jax.random.key(0)
 
 
-def window_of(observations, present=None):
-    observations = jnp.asarray(observations, jnp.float32)
-    present = np.ones(len(observations), bool) if present is None else present
-    return mpfjax.Series(observations, present=jnp.asarray(present))
+def window_of(observations):
+    present = jnp.ones(len(observations), bool)
+    return mpfjax.Series(jnp.asarray(observations, jnp.float32), present=present)
 
 
 def starts(model, window, num_particles, num_runs, key=KEY):
@@ -36,8 +33,6 @@ PLANE = mpfjax.LinearGaussianModel(
     np.eye(2), 0.01 * np.eye(2), np.eye(2), 0.09 * np.eye(2), np.zeros(2), 400 * np.eye(2)
 )
 PLACES = np.array([[3.0, 1.0], [3.3, 1.2], [0.0, 0.0], [3.1, 1.4]], np.float32)
-PRESENT = np.array([True, True, False, True])
-SEEN = mpfjax.Series.skipping(np.where(PRESENT[:, None], PLACES, np.nan))
 
 
 class WithKeys(mpfjax.AbstractStateSpaceModel):
@@ -54,18 +49,6 @@ class WithKeys(mpfjax.AbstractStateSpaceModel):
 
     def log_likelihood(self, observation, states):
         return jnp.sum(jax.scipy.stats.norm.logpdf(observation[None], states, 0.3), axis=1)
-
-
-@pytest.mark.parametrize("model", [WithKeys(), PLANE], ids=["keys", "noise"])
-@pytest.mark.weekly
-def test_evidence_and_moments_are_unbiased(model):
-    """The third observation is missing."""
-    states, log_z = starts(model, window_of(PLACES, PRESENT), 100, 300)
-    exact = kalman_filter(PLANE, SEEN)
-    ratios = np.exp(log_z - float(exact.log_marginal_likelihood))
-    assert_unbiased(ratios, loosest=0.06, errors=3.0)
-    means = ratios[:, None] * states.mean(axis=1)
-    assert_unbiased(means, np.asarray(exact.means[-1]), errors=3.5)
 
 
 class Edged(WithKeys):
@@ -154,19 +137,3 @@ def test_a_prior_a_hundred_thousand_times_as_wide_as_the_likelihood():
     exact = -np.log(10_000) + jax.scipy.stats.norm.logpdf(0.05, 0.0, spread)
     assert_unbiased(np.exp(log_z - exact), loosest=0.2)
     assert np.abs(states - 4000).max() < 1
-
-
-def test_a_model_whose_x_0_cannot_be_moved_is_refused():
-    class OnlyDraws(Rooms):
-        log_initial = None
-
-    class Whole(Rooms):
-        def sample_initial(self, key, num_particles):
-            return jax.random.randint(key, (num_particles, 2), 0, 3)
-
-    with pytest.raises(ValueError, match=r"OnlyDraws defines no log_initial"):
-        check_initial_density(OnlyDraws(), "a start")
-    with pytest.raises(ValueError, match=r"Whole has int32 in x_0"):
-        check_initial_density(Whole(), "a start")
-    with pytest.raises(ValueError, match=r"is conditionally linear"):
-        mpfjax.with_initialisation(mpfjax.particle_filter(CONDITIONALLY_LINEAR, 50))
