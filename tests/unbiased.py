@@ -15,7 +15,7 @@ def assert_unbiased(estimates, expected=1.0, loosest=np.inf, errors=4.0, slack=0
     assert (np.abs(gaps) <= errors * error + slack).all(), f"{gaps}, with errors of {error}"
 
 
-def ratios_to(exact, run):
+def ratios_to(exact, found):
     """Ẑ/Z of every run, for an exact log Z, or an exact filter's answer."""
-    log_z = getattr(exact, "log_marginal_likelihood", exact)
-    return np.exp(np.asarray(run.log_marginal_likelihood, float) - float(log_z))
+    log_z, exact = (getattr(run, "log_marginal_likelihood", run) for run in (found, exact))
+    return np.exp(np.asarray(log_z, float) - float(exact))

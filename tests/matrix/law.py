@@ -50,7 +50,7 @@ def kalman(law, y, u):
     """The answer for observations of which NaN are missing."""
     a, b, q, c, r, m, p0, shift = map(float, law)
     p, increments, filtered, predicted = p0**2, [], [(m, p0**2)], []
-    for y_t, u_t in zip(y, u, strict=True):
+    for y_t, u_t in np.array([y, u], float).T:
         m, p = a * m + b * u_t, a**2 * p + q**2
         predicted.append((m, p))
         increment = 0.0

@@ -12,34 +12,10 @@ from tests.marking import exactness
 from tests.user_models import ScalarLinear
 
 TRUTH = {"a": 0.8, "q": 0.6, "h": 1.0, "r": 0.5, "m": 0.5, "p": 0.3}
-# Powers of each unit in the model's numbers: of the states, and of the observations.
-POWERS = {"q": (1, 0), "h": (-1, 1), "r": (0, 1), "m": (1, 0), "p": (1, 0)}
-
-
-def observations(length=40):
-    rng = np.random.default_rng(3)
-    state, rows = TRUTH["m"] + TRUTH["p"] * rng.normal(), []
-    for _ in range(length):
-        state = TRUTH["a"] * state + TRUTH["q"] * rng.normal()
-        rows.append(state + TRUTH["r"] * rng.normal())
-    return np.array(rows, np.float32)
-
-
-OBSERVATIONS = observations()
-
-
-def unit_of(name, of_states, of_observations):
-    power = POWERS.get(name, (0, 0))
-    return of_states ** power[0] * of_observations ** power[1]
-
-
-def filter_in(of_states, of_observations, num_particles=200, **parameters):
-    numbers = TRUTH | parameters
-    model = ScalarLinear(
-        **{name: value * unit_of(name, of_states, of_observations)
-           for name, value in numbers.items()}
-    )  # fmt: skip
-    return mpfjax.particle_filter(model, num_particles, gradient="stop")
+# The units of these numbers for states in thousands, and observations in thousandths.
+UNITS = {"a": 1.0, "q": 1e3, "h": 1e-6, "r": 1e-3, "m": 1e3, "p": 1e3}
+MODEL = ScalarLinear(**TRUTH)
+OBSERVATIONS = mpfjax.simulate(jax.random.key(1), MODEL.in_matrices(), 40)[1][:, 0]
 
 
 def picked(names):
@@ -52,24 +28,23 @@ def exact_errors(names):
     def log_evidence(values):
         numbers = TRUTH | dict(zip(names, values, strict=True))
         model = ScalarLinear(**numbers).in_matrices()
-        return kalman_filter(model, jnp.asarray(OBSERVATIONS)[:, None]).log_marginal_likelihood
+        return kalman_filter(model, OBSERVATIONS[:, None]).log_marginal_likelihood
 
     hessian = jax.hessian(log_evidence)(jnp.array([TRUTH[name] for name in names]))
     information = -np.asarray(hessian, float)
     assert np.linalg.eigvalsh(information)[0] > 0
-    return dict(zip(names, np.sqrt(np.diag(np.linalg.inv(information))), strict=True))
+    return np.sqrt(np.diag(np.linalg.inv(information)))
 
 
 @pytest.mark.weekly
 def test_numbers_of_very_different_units_have_their_exact_errors():
     """Standard errors from 1e-4 to 1e3, none of them by a transform."""
-    units, names = (1e3, 1e-3), ("a", "m", "r")
+    names, model = ("a", "m", "r"), ScalarLinear(**{n: TRUTH[n] * UNITS[n] for n in TRUTH})
     found = standard_errors(
-        jax.random.key(0), filter_in(*units), jnp.asarray(units[1] * OBSERVATIONS),
-        parameters=picked(names), num_seeds=128,
+        jax.random.key(0), mpfjax.particle_filter(model, 200, gradient="stop"),
+        1e-3 * OBSERVATIONS, parameters=picked(names), num_seeds=128,
     )  # fmt: skip
-    exact = exact_errors(names)
-    ratios = [found[name] / unit_of(name, *units) / exact[name] for name in names]
+    ratios = np.array([found[name] / UNITS[name] for name in names]) / exact_errors(names)
     np.testing.assert_allclose(ratios, 1.0, atol=0.2)
 
 
@@ -96,8 +71,6 @@ def test_a_step_is_no_shorter_than_what_rounding_leaves():
 @pytest.mark.parametrize("num_seeds", [1, *exactness([6])])
 def test_too_few_seeds_are_said_to_be_too_few(num_seeds):
     """Eight particles and six seeds leave a quarter of them open; one seed tells nothing."""
-    filter, observations = filter_in(1.0, 1.0, 8), jnp.asarray(OBSERVATIONS)
+    filter, options = mpfjax.particle_filter(MODEL, 8, gradient="stop"), {"num_seeds": num_seeds}
     with pytest.warns(UserWarning, match="the seeds leave them uncertain.*num_seeds"):
-        standard_errors(
-            jax.random.key(5), filter, observations, parameters=picked("r"), num_seeds=num_seeds
-        )
+        standard_errors(jax.random.key(5), filter, OBSERVATIONS, parameters=picked("r"), **options)

@@ -8,8 +8,10 @@ import mpfjax
 from mpfjax.tuning.evidence import pose_evidence
 from mpfjax.tuning.problem import scores
 from tests.marking import exactness
-from tests.tuning.exact_posteriors import SERIES, Pushed, eager_mixture, log_evidence_of
-from tests.user_models import ScalarLinear, TwoSensors
+from tests.matrix.law import kalman, score
+from tests.tuning.examples import INPUTS, LAW, OBSERVATIONS, SERIES, Pushed, eager_mixture
+from tests.unbiased import assert_unbiased, ratios_to
+from tests.user_models import TwoSensors
 
 SEEN = np.array([[1.0, np.nan], [0.7, 0.3], [np.nan, 0.9], [np.nan, np.nan], [0.4, -0.2]])
 KEY, GAIN = jax.random.key(0), {"gain": lambda filter: filter.model.gain}
@@ -29,7 +31,7 @@ def test_a_missing_number_is_the_models_to_deal_with(missing):
 @pytest.mark.parametrize("name", ["particle filter", *exactness(["mixture"])])
 def test_the_score_by_fishers_identity_is_exact_without_any_gradient_of_the_moves(name):
     """Times Ẑ it is unbiased: in x_0, steps and observations, with inputs and a missing y."""
-    names = "amqr"
+    names = {"a": "a", "m": "m0", "q": "q", "r": "r"}
     filter = mpfjax.particle_filter(Pushed(), 20)
     if name == "mixture":
         filter = eager_mixture(20).replace(model=Pushed())
@@ -41,15 +43,10 @@ def test_the_score_by_fishers_identity_is_exact_without_any_gradient_of_the_move
         return jax.value_and_grad(problem.value, argnums=1)(key, problem.start())
 
     values, slopes = jax.vmap(value_and_score)(jax.random.split(KEY, 2000))
-    start = {n: getattr(Pushed(), n) for n in names}
-    exact = jax.value_and_grad(lambda reals: log_evidence_of(ScalarLinear(**reals)))
-    value, slope = exact(start)
-    ratios = np.exp(np.asarray(values, float) - float(value))
-    for n in names:
-        errors = ratios * (np.asarray(slopes[n], float) - float(slope[n]))
-        standard = errors.std() / np.sqrt(len(errors))
-        assert 0 < standard < 0.1
-        assert abs(errors.mean()) < 4 * standard, n
+    ratios = ratios_to(kalman(LAW, OBSERVATIONS, INPUTS).log_z, values)
+    for n, name in names.items():
+        exact = score(LAW, OBSERVATIONS, INPUTS, name)
+        assert_unbiased(ratios * (np.asarray(slopes[n], float) - exact), 0.0, loosest=0.1)
 
 
 def test_parameters_of_a_proposal_have_no_score_by_fishers_identity():

@@ -54,20 +54,12 @@ def short_fit(num_steps=6, *, parameters=NOISE, optimizer=ADAM, start=None, path
     return fit(**arguments | {"parameters": parameters, "checkpoint": checkpoint} | options)
 
 
-def series_of(length, rng):
-    state, rows = 0.5, []
-    for _ in range(length):
-        state = 0.9 * state + 0.6 * rng.normal()
-        rows.append(state + 0.5 * rng.normal())
-    return jnp.array(rows)
-
-
 @pytest.mark.weekly
 @pytest.mark.parametrize(("gradient", "score"), [("stop", "filter"), ("none", "fisher")])
 def test_the_maximum_is_found_with_its_standard_errors(gradient, score):
     """On a linear-Gaussian model, whose likelihood the Kalman filter gives."""
-    rng = np.random.default_rng(0)
-    sequences = [series_of(length, rng) for length in (30, 20)]
+    true = ScalarLinear().in_matrices()
+    sequences = [mpfjax.simulate(jax.random.key(1), true, length)[1][:, 0] for length in (30, 20)]
 
     def log_evidence(reals):
         a, log_r = reals

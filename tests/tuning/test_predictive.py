@@ -21,7 +21,7 @@ from mpfjax.tuning import (
 )
 from mpfjax.tuning.evidence import pose_evidence
 from tests.marking import weekly
-from tests.tuning.exact_posteriors import Pushed
+from tests.tuning.examples import Pushed
 
 KEY, NUM_STEPS = jax.random.key(0), 3
 SEEN = np.float32([1.5, 2.2, np.nan, 4.1, np.nan, np.nan, np.nan])

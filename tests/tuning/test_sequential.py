@@ -10,7 +10,7 @@ import mpfjax
 from mpfjax import Checkpoint, Series
 from mpfjax.tuning import Positive, smc2
 from mpfjax.tuning import sequential as observing
-from tests.tuning.exact_posteriors import (
+from tests.tuning.examples import (
     DEVIATION_OF_A,
     MEAN_OF_A,
     OBSERVATIONS,

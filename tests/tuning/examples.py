@@ -1,15 +1,14 @@
-"""Posteriors of one parameter on a grid, by filters that are exact, and the cases they are of."""
+"""What samplers are tried on: a linear model with known inputs, and a missing observation."""
 
-from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.stats import norm
 
 import mpfjax
 from mpfjax import Filter, KMeans, Merge, Propagate, Resample, Split
+from tests.matrix.law import Law
 from tests.user_models import ScalarLinear
 
 # The coefficient a of a linear model, with known inputs and a missing observation.
@@ -17,6 +16,8 @@ OBSERVATIONS = jnp.array([1.5, 0.2, jnp.nan, 0.8, 1.9, 1.1, 0.3, -0.9])
 INPUTS = jnp.array([0.6, -0.7, 0.2, 0.9, -0.3, 0.5, -0.8, 0.1])
 SERIES = mpfjax.Series.skipping(OBSERVATIONS, INPUTS)
 MEAN_OF_A, DEVIATION_OF_A = 0.3, 0.5
+LAW = Law(b=1.0)
+"""That of `Pushed`, for exact answers."""
 A = {"a": lambda filter: filter.model.a}
 
 
@@ -52,40 +53,3 @@ def eager_mixture(num_particles=10):
     regrouping = [Merge(2.0), Split(1.0, min_distance=0.1, min_share=0.0), KMeans(2)]
     moves = [Resample(), Propagate(), *regrouping]
     return Filter(model, moves, num_particles, 3, initial_moves=[KMeans(2, reseed=True)])
-
-
-class Exact(NamedTuple):
-    """Mean and variance of the posterior, and log p(y_1..y_t)."""
-
-    mean: float
-    variance: float
-    log_evidence: float
-
-
-def log_evidence_of(model):
-    """By a scalar Kalman filter, in which a missing observation is none."""
-    mean, variance, total = model.m, model.p**2, 0.0
-    for y, u in zip(np.asarray(OBSERVATIONS), np.asarray(INPUTS), strict=True):
-        mean, variance = model.a * mean + u, model.a**2 * variance + model.q**2
-        if np.isfinite(y):
-            innovation = variance + model.r**2
-            total += norm.logpdf(y, mean, jnp.sqrt(innovation))
-            gain = variance / innovation
-            mean, variance = mean + gain * (y - mean), (1 - gain) * variance
-    return total
-
-
-@cache
-def posterior_of_a(low=-1.7, high=2.3, r=0.5):
-    """Of a in an interval."""
-
-    def log_density(a):
-        return log_prior_of_a({"a": a}) + log_evidence_of(ScalarLinear(a=a, r=r))
-
-    grid = jnp.linspace(low, high, 402)[1::2]
-    log_densities = np.asarray(jax.jit(jax.vmap(log_density))(grid), float)
-    grid, density = np.asarray(grid, float), np.exp(log_densities - log_densities.max())
-    total = density.sum()
-    mean = density @ grid / total
-    log_evidence = np.log(total * (grid[1] - grid[0])) + log_densities.max()
-    return Exact(mean, density @ (grid - mean) ** 2 / total, log_evidence)
