@@ -1,11 +1,10 @@
-"""Every move and every chain of moves, by name: what is listed here inherits the contracts.
+"""Moves, and chains with what the matrix has not, by name: they inherit the contracts.
 
 `REGROUPINGS` and `WITHIN_COMPONENTS` are held to the contracts of their kind by
 `tests/moves/test_contracts.py`, `CHAINS` to those of filters by `tests/together/test_chains.py`. A
 new move or filter is one new line below; the tests then find it.
 """
 
-import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -31,9 +30,7 @@ from mpfjax import (
     Resample,
     Split,
 )
-from mpfjax.lookahead.pilot import AbstractLookahead
 from mpfjax.moves.objects.clusters import PropagateInClusters
-from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.moves.resampling.gaussian import RegenerateObjects
 
 NUM_PARTICLES = 48
@@ -105,32 +102,6 @@ def _chain(*before, m: int = NUM_COMPONENTS, then=(), proposal=None) -> Callable
     )
 
 
-def _metropolis(m: int) -> Callable[..., Filter]:
-    """A Metropolis move, twice, after the particles are resampled by the likelihood."""
-
-    def make(model):
-        moves = [
-            Predict(),
-            Reweight(),
-            Resample("stratified", ess_threshold=0.9),
-            RandomWalkMetropolis(),
-            RandomWalkMetropolis(),
-            KMeans(2),
-        ]
-        initial = [KMeans(3, reseed=True)] if m > 1 else []
-        return Filter(model, moves, NUM_PARTICLES, m, initial_moves=initial)
-
-    return make
-
-
-class Halfway(AbstractLookahead):
-    """The root of the likelihood of the mean: a look-ahead with tails that are not too thin."""
-
-    def log_factors(self, mixture, now):
-        mean = now.model.transition_mean(mixture.particles)
-        return 0.5 * now.model.log_likelihood(now.observation, mean)
-
-
 def _joint(make: Callable[[MultiObjectModel], Filter]) -> Callable[..., Filter]:
     """A filter of two objects, independent copies that give rise to the same observations."""
     return lambda model: make(MultiObjectModel(model, 2, shared_observation=True))
@@ -150,9 +121,6 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
             mpfjax.with_resampling(
                 _mpf(m, proposal=GaussNewtonProposal())(model), Resample(ess_threshold=0.5)
             )
-        ),
-        "gaussian mixture rqmc": lambda model: mpfjax.with_quasi_monte_carlo(
-            mpfjax.gaussian_mixture_particle_filter(model, NUM_PARTICLES, m)
         ),
         "guided mpf": _mpf(m, proposal=GaussNewtonProposal()),
         "guided, sorted": _chain(
@@ -183,42 +151,16 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
 QUICK_CHAINS = ("pf rqmc", "mpf", "gaussian mixture")
 CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),
-    "pf multinomial": _pf(scheme="multinomial"),
     "pf adaptive": _pf(ess_threshold=0.5),
-    "pf stratified": _pf(scheme="stratified"),
     "pf rqmc": _pf(noise="rqmc"),
-    "pf rqmc of many initial draws": lambda model: mpfjax.with_proposals_per_particle(
-        mpfjax.with_initial_selection(_pf(noise="rqmc")(model), 3), 2
-    ),
-    "auxiliary pf, adaptive": lambda model: mpfjax.with_lookahead(
-        _pf(ess_threshold=0.5)(model), GaussNewtonProposal()
-    ),
-    "auxiliary mpf": lambda model: mpfjax.with_lookahead(_mpf()(model), Halfway()),
-    "guided pf": _pf(proposal=GaussNewtonProposal()),
     **_of_components(NUM_COMPONENTS),
     **{
         f"{name}, M = {MANY_COMPONENTS}": chain
         for name, chain in _of_components(MANY_COMPONENTS).items()
         if name in OTHERWISE_OF_MANY
     },
-    "metropolis": _metropolis(1),
-    "mixture with metropolis": _metropolis(NUM_COMPONENTS),
     "every second step a random walk": _chain(
         Resample(), then=[Every(2, [RandomWalkMetropolis()])]
-    ),
-    "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
-    "guided mpf rqmc of families": lambda model: mpfjax.with_proposals_per_particle(
-        _mpf(proposal=GaussNewtonProposal(), noise="rqmc")(model), 3
-    ),
-    "ps adaptive, another order": _joint(
-        lambda joint: mpfjax.map_moves(
-            mpfjax.partitioned_sampling(joint, NUM_PARTICLES, (1, 0)),
-            lambda move: (
-                dataclasses.replace(move, scheme="multinomial", ess_threshold=0.5)
-                if isinstance(move, Resample)
-                else move
-            ),
-        )
     ),
     "dps": _joint(
         lambda joint: mpfjax.distributed_partitioned_sampling(

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import chex
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,13 +28,6 @@ PF = CHAINS["pf"](QUADRATIC)
 
 def mean(mixture):
     return mixture.mean()
-
-
-@pytest.mark.exactness
-def test_one_component_is_the_particle_filter_to_the_bit():
-    mixture = mpfjax.mixture_particle_filter(QUADRATIC, PF.num_particles, 1, regroup_every=1)
-    runs = [mpfjax.run_filter(KEY, filter, OBSERVATIONS) for filter in (PF, mixture)]
-    chex.assert_trees_all_equal(*runs)
 
 
 @pytest.mark.exactness

@@ -7,7 +7,6 @@ import pytest
 
 import mpfjax
 from mpfjax.lookahead.pilot import PilotLookahead
-from mpfjax.moves.initial import SelectInitial
 
 KEY, GUIDE = jax.random.key(0), mpfjax.GaussNewtonProposal()
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
@@ -36,23 +35,6 @@ def test_the_keywords_of_recipes_are_transforms():
     for filter in (plain, mpfjax.particle_filter(MODEL, 32, proposal=GUIDE)):
         scored = mpfjax.with_score_gradient(filter)  # which changes derivatives alone
         chex.assert_trees_all_equal(final(scored), final(filter))
-
-
-@pytest.mark.exactness
-def test_they_compose_on_a_chain_of_ones_own():
-    filter = own_chain()
-    for change in (
-        mpfjax.with_quasi_monte_carlo,
-        mpfjax.with_score_gradient,
-        lambda f: mpfjax.with_initial_selection(f, 3),
-        lambda f: mpfjax.with_resampling(f, mpfjax.Resample("stratified")),
-    ):
-        filter = change(filter)
-    every, propagate = filter.moves
-    assert every.moves[0].scheme == "stratified"
-    assert (propagate.noise, propagate.gradient, filter.initial_noise) == ("rqmc", "stop", "rqmc")
-    assert isinstance(filter.initial_moves[0], SelectInitial)
-    assert np.isfinite(mpfjax.run_filter(KEY, filter, OBSERVATIONS).log_marginal_likelihood)
 
 
 def test_the_score_gradient_reaches_the_resampling_inside_of_moves():

@@ -10,11 +10,8 @@ from benchmarks.coverage import coverage, covers
 from benchmarks.localisation.filters import AdaptiveMonteCarlo
 from benchmarks.masses.scenes import SCENES
 from benchmarks.partitioned_sampling.posterior import distance_maps
-from benchmarks.scenes import distracter_scene
-from benchmarks.visual_tracking.following import Snapshot, follow, track_rows
+from benchmarks.visual_tracking.following import Snapshot, track_rows
 from mpfjax.metrics.tracking_scores import overlap
-from mpfjax.vision.boxes.recipes import PRESETS
-from tests.marking import weekly
 
 
 @pytest.mark.exactness
@@ -139,29 +136,6 @@ def test_hypotheses_differ_where_any_number_does():
     )
 
 
-@pytest.fixture(scope="module")
-def scenes():
-    return [distracter_scene(jax.random.key(seed)) for seed in range(12)]
-
-
-def gaps(scene):
-    """How far object 1 is clear of the place of the distracter, in each frame."""
-    offsets = np.abs(scene.boxes[:, 0, :2] - scene.distracter[7, :2])
-    return np.max(offsets - scene.boxes[0, 0, 2:], axis=1)
-
-
-def test_the_distracter_stands_over_object_one_which_walks_away(scenes):
-    for scene in scenes:
-        there = np.isfinite(scene.distracter).all(axis=1)
-        assert (np.flatnonzero(there) + 1).tolist() == [3, 4, 5, 6, 7, 8]
-        for t in np.flatnonzero(there):
-            np.testing.assert_array_equal(scene.distracter[t], scene.boxes[2, 0])
-            assert not overlap(scene.distracter[t][None], scene.boxes[t, 1:]).any()
-        # Corners are rounded to whole pixels.
-        assert 3 <= gaps(scene)[7] <= 13
-        assert gaps(scene)[-1] >= 11
-
-
 def snapshots(references=True):
     """Three components in three frames of one run; the second dies and its label is used again."""
     active = np.array([[1, 1, 0], [1, 0, 0], [1, 1, 1]], bool)
@@ -187,22 +161,3 @@ def test_a_track_is_a_life_of_a_component():
 def test_or_a_hypothesis_about_one_of_the_given_boxes():
     rows = track_rows(snapshots(), by_reference=True)
     assert rows[:, :2].tolist() == [[1, 1], [1, 2], [2, 1], [3, 1], [3, 1], [3, 2]]
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize("name", ["default", *weekly(["paper"])])
-def test_the_recipes_keep_to_objects_that_stand_still(name):
-    """A red and a blue box on grey: a component is on each, and in all three frames."""
-    still, boxes = (
-        np.full((48, 64, 3), 110, np.uint8),
-        np.array([[8.0, 10, 8, 14], [40, 24, 8, 14]]),
-    )
-    for (x, y, w, h), colour in zip(boxes.astype(int), [(220, 10, 10), (10, 10, 220)], strict=True):
-        still[y : y + h, x : x + w] = colour
-    keys = jax.random.split(jax.random.key(0), 1)
-    snapshots = list(follow(keys, PRESETS[name](still, boxes)["mpf"], [still] * 3))
-    assert len(snapshots) == 3
-    for snapshot in snapshots:
-        means = snapshot.means[0][snapshot.active[0]]
-        gaps = np.abs(means[:, None, :2] - boxes[None, :, :2] - [4, 7]).max(axis=2)
-        assert (gaps.min(axis=0) < 3).all()

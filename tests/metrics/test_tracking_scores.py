@@ -1,16 +1,9 @@
 """Scores of tracks so small that each can be worked out by hand."""
 
-import importlib.util
-
 import numpy as np
 import pytest
 
 from mpfjax.metrics.tracking_scores import multi_object_scores, overlap
-
-needs_trackeval = pytest.mark.skipif(
-    importlib.util.find_spec("trackeval") is None,
-    reason="scoring tracks needs the extra 'trackeval'",
-)
 
 
 def row(frame, id, x, y=0.0, w=10.0, h=20.0):
@@ -30,10 +23,10 @@ def check(scores, **expected):
     assert scores == pytest.approx(perfect | expected)
 
 
-@needs_trackeval
 @pytest.mark.parametrize("tracks", [NONE, np.array([row(t, 1, 100.0, w=0.0) for t in (1, 2)])])
 def test_tracks_that_find_nothing(tracks):
     """None at all, and boxes without area."""
+    pytest.importorskip("trackeval", reason="scoring needs the extra 'trackeval', of 'test'")
     nothing = dict.fromkeys(RATIOS, 0.0)
     nothing["MOTA"] = -len(tracks) / 8
     check(multi_object_scores(tracks, TRUTH), **nothing, misses=8, false_positives=len(tracks))

@@ -17,31 +17,14 @@ from mpfjax.moves.objects.association import associate
 from mpfjax.moves.objects.bernoulli import TARGETS, Associate
 from mpfjax.moves.propagation.propagate import Predict
 from mpfjax.moves.resampling.gaussian import RegenerateObjects
+from tests.assignments import enumerated
 from tests.marking import weekly
-from tests.models.test_clutter import SETS, Wide, by_associations
+from tests.models.test_clutter import OBJECT, SETS, Wide, by_associations
 from tests.unbiased import assert_unbiased
 
 KEY = jax.random.key(0)
-A, Q, R, P0, P_D, CLUTTER = 0.9, 0.5, 0.3, 1.0, 0.7, 0.2
-OBJECT = mpfjax.LinearGaussianModel([[A]], [[Q]], [[1.0]], [[R]], [0.0], [[P0]])
+A, Q, R, P0, P_D, CLUTTER, NAN = 0.9, 0.5, 0.3, 1.0, 0.7, 0.2, np.nan
 SENSOR = ClutteredModel(OBJECT, P_D, CLUTTER)
-NAN = np.nan
-
-
-def enumerated(pairs, missed, alone):
-    """The probability of each pair, and log of the sum over all assignments."""
-    (m, k), total, shares = pairs.shape, 0.0, np.zeros(pairs.shape)
-    for choice in itertools.product(range(-1, k), repeat=m):
-        taken = [column for column in choice if column >= 0]
-        if len(set(taken)) < len(taken):
-            continue
-        weight = np.prod([alone[j] for j in range(k) if j not in taken])
-        weight *= np.prod([missed[i] if j < 0 else pairs[i, j] for i, j in enumerate(choice)])
-        total += weight
-        for row, column in enumerate(choice):
-            if column >= 0:
-                shares[row, column] += weight
-    return shares / total, np.log(total)
 
 
 def random_weights(seed, m, k):
@@ -200,16 +183,15 @@ def test_one_scan_is_that_of_all_associations(apart):
 
 @pytest.mark.exactness
 def test_a_known_single_object_is_that_of_all_associations():
-    """And E[x_t]; with certain detection and hardly any clutter it is the Kalman filter's."""
-    alone = {"rate": 1e-12, "survival_probability": 1.0}
+    """And E[x_t]."""
     sets, n = jnp.asarray(SETS, jnp.float32), 300
+    moves = [Predict(), associating(undetected_particles=1)]
+    filter = Filter(model(rate=1e-12, survival_probability=1.0), moves, n + 1, 3)
+    single = bernoulli_mixture(filter, np.zeros((1, n, 1)), [1.0])
 
-    def run(key, targets, sets):
-        moves = [Predict(), associating(undetected_particles=1)]
-        filter = Filter(targets, moves, n + 1, 3)
+    def run(key):
         keys = jax.random.split(key, 1 + len(sets))
-        mixture = bernoulli_mixture(filter, np.zeros((1, n, 1)), [1.0])
-        mixture = mixture.replace(particles=jax.random.normal(keys[0], (n + 1, 1)))
+        mixture = single.replace(particles=jax.random.normal(keys[0], (n + 1, 1)))
 
         def step(mixture, data):
             mixture, info = filter.step(*data[:1], mixture, data[1])
@@ -218,21 +200,11 @@ def test_a_known_single_object_is_that_of_all_associations():
         mixture, increments = jax.lax.scan(step, mixture, (keys[1:], sets))
         return jnp.sum(increments), mpfjax.estimate_targets(mixture).means[0, 0]
 
-    run_all = jax.jit(jax.vmap(run, in_axes=(0, None, None)))
-    keys = jax.random.split(KEY, 200)
-    totals, means = run_all(keys, model(**alone), sets)
+    totals, means = jax.jit(jax.vmap(run))(jax.random.split(KEY, 200))
     exact, mean = by_associations(SETS)
     ratios = np.exp(np.asarray(totals)) / exact
     assert_unbiased(ratios, loosest=0.02)
     assert_unbiased(ratios * np.asarray(means), mean, loosest=0.02)
-
-    data, clutter = np.array([[0.4], [0.9], [-0.2], [1.5], [-1.0]]), 1e-6
-    sensor = ClutteredModel(OBJECT, 1.0, clutter)
-    certain = TargetsModel(sensor, Birth(jnp.float32(1e-12)), 1.0)
-    totals, _ = run_all(keys, certain, jnp.asarray(data[:, None], jnp.float32))
-    kalman = mpfjax.exact.kalman_filter(OBJECT, jnp.asarray(data, jnp.float32))
-    log_z = float(kalman.log_marginal_likelihood) - len(data) * np.log(clutter)
-    assert_unbiased(np.exp(np.asarray(totals, float) - log_z), loosest=0.03)
 
 
 def updated(gaussian, z):
@@ -384,10 +356,6 @@ def test_objects_without_room_are_told_and_the_table_has_the_rest():
     assert len(set(zip(table["step"], table["label"], strict=True))) == 6
     # The others still count.
     np.testing.assert_allclose(run.collected.expected_number[-1], 3, atol=0.7)
-    with pytest.raises(ValueError, match="num_slots: "):
-        mpfjax.monte_carlo(KEY[None], mpfjax.bernoulli_filter(crowd, 900, 2), scans, num_slots=600)
-    with pytest.raises(ValueError, match="not for islands"):
-        mpfjax.run_islands(KEY, mpfjax.bernoulli_filter(crowd, 900, 2), scans, num_islands=2)
     with pytest.raises(ValueError, match="model: "):
         Filter(OBJECT, [Predict(), associating()], 1000, 3)
     with pytest.raises(ValueError, match="num_particles: 100 is less than 402"):

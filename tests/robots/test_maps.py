@@ -7,7 +7,6 @@ import yaml
 from PIL import Image
 
 from mpfjax import robots
-from mpfjax.models.series import check_differences
 from mpfjax.models.targets import Box, Disc
 
 SOLID = np.zeros((60, 60), bool)
@@ -121,13 +120,3 @@ def test_places_that_float32_cannot_tell_apart_are_refused(corner):
         Disc(np.array([0.0, corner]), 2.0)
     with pytest.raises(ValueError, match="high: "):
         Box(np.array([0.0, corner]), np.array([9.0, corner + 5.0]))
-
-
-def test_a_walk_in_degrees_of_longitude_is_refused():
-    """Its steps of .1 m are lost in float32; times between observations only seem to differ."""
-    walk = 8.4 + 1e-6 * np.cumsum(np.random.default_rng(0).normal(size=50))
-    with pytest.raises(ValueError, match=r"y: float32 cannot tell"):
-        check_differences("y", walk)
-    between = np.diff(1e6 + 0.1 * np.arange(50))
-    check_differences("y", between)
-    check_differences("y", 1e4 * (walk - 8.4))

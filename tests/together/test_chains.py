@@ -67,7 +67,7 @@ def chain_filter(chain):
 # The parts of all other chains have an exact answer in a file of their own; other models, and more
 # slots than particles, are in the matrix.
 COVERING = ("pf rqmc", "mpf", "dps")
-APPROXIMATE = {"gaussian mixture", "gaussian mixture rqmc"}
+APPROXIMATE = {"gaussian mixture"}
 EXACT = quick_of([chain for chain in CHAINS if chain not in APPROXIMATE], COVERING, one_in=8)
 
 

@@ -66,7 +66,6 @@ def test_all_objects_have_the_input(shift):
 FILTER = mpfjax.particle_filter(Drawn(jnp.array(0.0)), 32)
 INPUTS = jnp.array([1.0, 1.0, -1.0, 0.5])
 OBSERVATIONS = jnp.array([0.6, 1.1, 0.1, -0.2])
-SERIES = mpfjax.Series(OBSERVATIONS, INPUTS)
 
 
 @pytest.mark.exactness
@@ -79,21 +78,12 @@ def test_an_input_of_a_step_that_is_nan_or_not_there_is_an_error():
 
 
 @pytest.mark.exactness
-def test_monte_carlo_islands_and_studies_hand_them_on(tmp_path):
-    def log_z(key):
-        run = mpfjax.run_filter(key, FILTER, OBSERVATIONS, nothing, inputs=INPUTS)
-        return run.log_marginal_likelihood
-
-    runs = mpfjax.monte_carlo(KEY[None], FILTER, SERIES, nothing)
-    study = mpfjax.Study({"pf": lambda num_particles: FILTER}, [32], KEY[None], SERIES)
+def test_a_study_hands_them_on(tmp_path):
+    series = mpfjax.Series(OBSERVATIONS, INPUTS)
+    study = mpfjax.Study({"pf": lambda num_particles: FILTER}, [32], KEY[None], series)
     (cell,) = mpfjax.run_study(study, tmp_path)
-    island = mpfjax.run_islands(KEY, FILTER, SERIES, nothing, num_islands=1)
-    for found, key in (
-        (runs.log_marginal_likelihood[0], KEY),
-        (cell["log_marginal_likelihood"][0], KEY),
-        (island.log_marginal_likelihood, jax.random.fold_in(KEY, 0)),
-    ):
-        np.testing.assert_allclose(found, log_z(key), rtol=1e-5)
+    run = mpfjax.run_filter(KEY, FILTER, series, nothing)
+    np.testing.assert_allclose(cell["log_marginal_likelihood"][0], run.log_marginal_likelihood)
 
 
 def test_nothing_compiles_again():

@@ -69,6 +69,7 @@ LOST = {
     "modified Julian dates": 60000.0 + np.arange(40) / 1440,
     "UTM metres": np.stack([np.arange(40.0), 5.6e6 + np.random.default_rng(0).normal(size=40)], 1),
     "indices": 2**24 + np.arange(5.0),
+    "degrees of longitude": 8.4 + 1e-6 * np.cumsum(np.random.default_rng(0).normal(size=50)),
 }
 
 
@@ -95,7 +96,8 @@ def test_differences_that_float32_loses_are_refused_where_arrays_enter(name):
         np.diff(SECONDS + 1e-3), np.full(9, 0.1), np.full(9, 1.7e9), 300 + OTHERS[0],
         1e4 + np.random.default_rng(0).normal(size=99), np.arange(1000), 1e8 * np.arange(9.0),
         2**20 + np.arange(9), np.array([1.0, 1.0 + 1e-9]), np.array([1.7e9]),
-        np.random.default_rng(0).integers(0, 2**31, 9), 
+        np.random.default_rng(0).integers(0, 2**31, 9), np.diff(1e6 + 0.1 * np.arange(50)),
+        0.01 * np.cumsum(np.random.default_rng(0).normal(size=50)),
         5 + np.random.default_rng(0).normal(size=10**5), np.array([np.nan, np.inf, 1.7e9, 1.7e9]),
     ],
 )  # fmt: skip

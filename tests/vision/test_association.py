@@ -13,6 +13,7 @@ from mpfjax.vision.tracking.associate import (
 )
 from mpfjax.vision.tracking.gaussian import Gaussian, overlapping
 from mpfjax.vision.tracking.pairs import Pairs
+from tests.assignments import enumerated
 
 
 def possible(values):
@@ -26,17 +27,10 @@ def matrix(pairs, none):
     return values
 
 
-def brute_force(odds):
+def brute_force(log_odds):
     """The marginals, by summing over all assignments."""
-    total, pairs = 0.0, np.zeros(odds.shape)
-    for columns in itertools.product(range(-1, odds.shape[1]), repeat=len(odds)):
-        chosen = [(row, column) for row, column in enumerate(columns) if column >= 0]
-        if len({column for _, column in chosen}) == len(chosen):
-            weight = np.prod([odds[pair] for pair in chosen])
-            total += weight
-            for pair in chosen:
-                pairs[pair] += weight
-    return pairs / total
+    rows, columns = map(np.ones, log_odds.shape)
+    return enumerated(np.exp(log_odds), rows, columns)[0]
 
 
 @pytest.mark.parametrize(("loops", "bound"), [(False, 3e-3), (True, 0.15)])
@@ -47,7 +41,7 @@ def test_the_marginals_are_those_of_all_assignments(loops, bound):
         log_odds = rng.normal(1, 2, (3, 4))
         if not loops:  # a chain: row 0 with columns 0 and 1, row 1 with 1 and 2, row 2 with 2 and 3
             log_odds[np.abs(np.arange(4)[None] - np.arange(3)[:, None] - 0.5) > 0.5] = -np.inf
-        gaps.append(np.abs(marginals(log_odds) - brute_force(np.exp(log_odds))))
+        gaps.append(np.abs(marginals(log_odds) - brute_force(log_odds)))
     assert np.max(gaps) < bound
     assert np.mean(gaps) < bound / 5
 
@@ -55,7 +49,7 @@ def test_the_marginals_are_those_of_all_assignments(loops, bound):
 def test_marginals_of_large_odds_are_those_of_all_assignments():
     """As detectors make them that err by half a hundredth of a box; larger ones do not overflow."""
     for log_odds in ([[12.0, 10.5], [11.5, 6.0]], [[12.0, 2.0], [3.0, -np.inf]], [[11.0], [8.0]]):
-        expected = brute_force(np.exp(np.array(log_odds)))
+        expected = brute_force(np.array(log_odds))
         np.testing.assert_allclose(marginals(np.array(log_odds)), expected, atol=0.05)
     huge = np.array([[400.0, 350.0, -np.inf], [-900.0, 20.0, 19.0]])
     np.testing.assert_allclose(marginals(huge), [[1, 0, 0], [0, 0.73, 0.27]], atol=0.01)

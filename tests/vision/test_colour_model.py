@@ -91,13 +91,6 @@ def test_bands_tell_a_box_from_its_mirror_image(frame):
     assert squared_distances(bands, upside_down, true)[0] > 1
 
 
-def test_a_box_outside_lies_at_the_largest_distance(frame):
-    model = model_of(frame, num_parts=3)
-    outside = states((-50.0, 20, 1, 1, 0), (20.0, 20, -1, 1, 1), (20.0, 20, 1, 0, 1))
-    distances = squared_distances(model, jnp.asarray(frame), outside)
-    np.testing.assert_array_equal(np.asarray(distances), 3.0)
-
-
 def test_x0_scatters_equally_about_all_references(frame):
     model = model_of(frame)
     start = model.sample_initial(jax.random.key(0), 4001)

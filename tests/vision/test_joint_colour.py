@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import mpfjax
 from mpfjax.vision.boxes.joint_colour import joint_colour_model
 from mpfjax.vision.colour import HSVColours
 
@@ -89,15 +88,3 @@ def test_a_template_from_elsewhere(frame):
     assert -2 * own.sigma**2 * own.log_likelihood(jnp.asarray(frame), there)[0] < 0.05
     drawn = learned.sample_initial(KEY, 100).box[:, 0, :2].mean(axis=0)
     np.testing.assert_allclose(drawn, centres()[0], atol=1)
-
-
-def test_another_lambda_and_order_are_the_same_program(frame):
-    """They differ in the values of arrays alone, on which no compilation depends."""
-    filters = [
-        mpfjax.partitioned_sampling(joint_colour_model(frame, BOXES, lambda_=lambda_), 12, order)
-        for lambda_, order in ((10.0, (0, 1, 2)), (40.0, (2, 0, 1)))
-    ]
-    assert not eqx.tree_equal(*filters)
-    shapes, rest = zip(*(eqx.partition(each, eqx.is_array) for each in filters), strict=True)
-    assert eqx.tree_equal(*rest)
-    assert eqx.tree_equal(*(jax.eval_shape(lambda tree=tree: tree) for tree in shapes))
