@@ -138,6 +138,12 @@ def test_scores_of_chains_that_become_sure_are_strong_and_of_those_that_end_are_
     far = [[((5, 5), (300, 300)), [1.0, 0.3]] for t in range(120)]
     assert float(scored(far, lasting=1000).strong) == pytest.approx(0.5, abs=0.05)
     assert float(scored(far, lasting=50).strong) < 0.35
+    # Each of eleven that pass, nine tenths of a box a frame, has rising scores; or they are
+    # flashes: at places where no chain has a second one.
+    passing = [[((5, 5), (400, 9 * (t % 11))), [1.0, 0.2 + 0.08 * (t % 11)]] for t in range(121)]
+    assert float(scored(passing).strong) < 0.45
+    lone = [[((5, 5), (400, 90 * (t % 11))), [1.0, 0.2 + 0.06 * (t % 11)]] for t in range(121)]
+    assert float(scored(lone).strong) > 0.7
 
 
 def test_what_an_empty_street_leaves_does_not_become_sure():

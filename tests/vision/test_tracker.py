@@ -172,13 +172,6 @@ def test_nothing_leaks_over_many_random_frames():
     assert max(ever) == state.last_identity == len(ever)
 
 
-@pytest.mark.parametrize(("rate", "names"), [(8, 1), (25, 6)])
-def test_what_begins_may_move_further_in_a_frame_where_frames_are_rare(rate, names):
-    """By a box from frame to frame: an object at 8 frames a second, and six at 25."""
-    walk = [np.array([[20.0 * t, 50, 20, 40]]) for t in range(6)]
-    assert steps(ObjectTracker(M, frames_per_second=rate), walk)[-1].identities.max() == names
-
-
 # --- frames without a detector, dropped frames, long covers -----------------------------------
 
 
@@ -317,6 +310,20 @@ def test_boxes_of_another_class_are_no_duplicates(classes, number):
     pair = np.array([[20, 20, 10, 20], [20, 22, 10, 19]], float)
     tracks = run([[]] * 5, seen=lambda t, c: pair, classes=lambda t: classes)
     assert len(living(tracks[-1])) == number
+
+
+@pytest.mark.parametrize(("speed", "is_tracked"), [(20, True), (34, True), (111, False)])
+def test_an_object_that_moves_its_length_in_a_frame_is_tracked_from_its_second(speed, is_tracked):
+    """Beside one that stands still, whose detections are not taken from it; no further, though."""
+    tracker, still = ObjectTracker(M, frames_per_second=10), [200, 100, 16, 37]
+    state = tracker.init()
+    for t in range(12):
+        moving = [[400, 1300 - speed * t, 16, 37]] * (t >= 4)
+        state, tracks = tracker.step(None, state, None, np.array([still, *moving], float))
+        assert tracks.identities[0] == 1
+        if t > 4:
+            assert tracks.confirmed.all() == is_tracked
+    assert (tracks.identities.max() == 2) == is_tracked
 
 
 # --- a camera that shakes ------------------------------------------------------------------

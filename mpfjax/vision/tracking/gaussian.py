@@ -100,6 +100,15 @@ class Gaussian(NamedTuple):
         velocity = self.velocity + along(self.place, faster)
         return self._replace(place=self.place + along(self.place, shift), velocity=velocity)
 
+    def accelerate(self, deviations: Numbers, frames: float) -> "Gaussian":
+        """The moments where velocities had so much more noise, so many frames ago."""
+        more = deviations**2
+        return self._replace(
+            var_place=self.var_place + frames**2 * more,
+            cov=self.cov + frames * more,
+            var_velocity=self.var_velocity + more,
+        )
+
     def at(self, rows: np.ndarray) -> "Gaussian":
         """The moments of some rows."""
         if rows.dtype == bool and rows.all():

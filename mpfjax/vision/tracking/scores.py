@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import isotonic_regression
 from scipy.special import expit, logit
 
-from mpfjax.vision.tracking.gaussian import overlapping
-from mpfjax.vision.tracking.pairs import Pairs
+from mpfjax.vision.tracking.gaussian import overlapping, shared
+from mpfjax.vision.tracking.pairs import Pairs, intervals
 
 # Minutes: in a street that is empty for a while, what is left must not set what is sure.
 _REMEMBERED = 8192
@@ -21,6 +21,7 @@ _SLOPE = 0.15  # the prior odds are logistic in the share, of this scale
 PRIOR = 5.0  # detections that the prior of each bin counts as
 KEPT = 0.995  # kept from each frame to the next
 _SAME, _DUPLICATE = 0.3, 0.6  # least overlap of boxes in a chain, and of a box with its duplicate
+_AS_LARGE = 0.6  # least overlap of boxes with the same centre, of a chain whose boxes are apart
 _GONE = 2  # longest gap in a chain, in frames with detections
 
 Boxes, Scores = Float[np.ndarray, "d k"], Float[np.ndarray, " d"]
@@ -114,6 +115,8 @@ class ScoreState(NamedTuple):
             overlapping(boxes, detections, _SAME, variance) for boxes in (ahead, self.boxes, moved)
         ]
         kinds[1:] = [each._replace(values=1 + each.values) for each in kinds[1:]]
+        if moved.shape[1] > 2:
+            kinds.append(self._fast(moved, detections, frames))
         rows, columns, nearness = (np.concatenate([each[i] for each in kinds]) for i in range(3))
         rows = Pairs(rows, columns, nearness, kinds[0].shape).partners
         is_detected = rows >= 0
@@ -141,6 +144,22 @@ class ScoreState(NamedTuple):
             boxes=boxes, steps=steps, unseen=unseen, age=age, sure=sure, pending=pending,
             good=KEPT * self.good + good, bad=KEPT * self.bad + bad,
         )  # fmt: skip
+
+    def _fast(self, moved: Chains, detections: Boxes, frames: float) -> Pairs:
+        """Second boxes of chains, apart from the first: as large, and within one box a frame.
+
+        The step of these chains is not known yet. Those with a choice are not continued.
+        """
+        young = np.flatnonzero(self.age == 1)
+        first, reach = moved[young], frames * moved[young, 2:]
+        low, high = first[:, 0] - reach[:, 0], first[:, 0] + reach[:, 0]
+        rows, columns = intervals(low, high, detections[:, 0])
+        sizes = np.array([0, 0, 1, 1])
+        alike = shared(sizes * first[rows], sizes * detections[columns])
+        near = np.abs(detections[columns, 1] - first[rows, 1]) < reach[rows, 1]
+        pairs = Pairs(young[rows], columns, _SAME * alike, (len(moved), len(detections)))
+        pairs = pairs.at(near & (alike > _AS_LARGE))
+        return pairs.at(~pairs.rivals)
 
     def strong_share(self) -> float:
         """The share above which a detection is more probably an object than none."""
