@@ -62,7 +62,7 @@ def draw_components(
 @checked
 def draw_plane(
     run: FilterRun | ParticleMixture,
-    indices: tuple[int, int],
+    indices: tuple[int, int] = (0, 1),
     *,
     truth: np.ndarray | None = None,
     ax: Axes | None = None,

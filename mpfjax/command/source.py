@@ -70,8 +70,8 @@ def open_source(options: Namespace) -> Source:
     check_outputs(options.out, outputs, inputs)
     rows, points = None, options.point_deviation is not None
     if detections is not None:
-        columns = "points" if points else "classes" if options.classes else "boxes"
-        rows = box_files.read_detections(detections, columns=columns)
+        kinds = {"with_classes": options.classes, "points": points}
+        rows = box_files.read_detections(detections, **kinds)
     folder, info = path, sequences.SequenceInfo()
     if not has_pixels:
         folder = path if path.is_dir() else _sequence_of(path) or path

@@ -32,7 +32,7 @@ class RGBColours(Checked):
     Vermaak et al. (2003), section 5.2. Raises `ValueError` for a number of bins below 1.
     """
 
-    num_bins: Count = eqx.field(static=True)
+    num_bins: Count = eqx.field(static=True, default=30)
 
     num_channels = 3
     """How many histograms a box has."""

@@ -277,7 +277,7 @@ def test_only_what_is_below_the_share_of_the_heaviest_is_pruned(masses):
     np.testing.assert_array_equal(after.active, lives)
     kept = lives[np.asarray(before.component_indicators)]
     np.testing.assert_array_equal(after.log_weights[kept], before.log_weights[kept])
-    assert Prune(1e-3).approximate
+    assert Prune().approximate
     assert Prune(1e-3)(KEY, before, mpfjax.Step(MODEL, None)) is before
 
 

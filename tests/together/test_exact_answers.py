@@ -83,7 +83,7 @@ def test_prior_masses_of_dps_are_those_of_the_living_and_the_total_is_the_eviden
     model = MultiObjectModel(ScalarLinear(), 2, shared_observation=True)
     now = mpfjax.Step(model, jnp.array(0.5))
     prior, evidence = (
-        eqx.filter_jit(Partitioned(None, reassembly=name))(jax.random.key(0), before, now)
+        eqx.filter_jit(Partitioned(reassembly=name))(jax.random.key(0), before, now)
         for name in ("prior", "evidence")
     )
     shares = np.exp(np.asarray(before.log_mixture_weights, float))

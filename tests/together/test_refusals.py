@@ -90,12 +90,11 @@ TARGETS = {
 }  # fmt: skip
 # The arguments of a good call that have no default, or whose default leaves something out.
 GOOD = {
-    **alike({}, mpfjax.QuadraticModel, KMeans, mpfjax.Split, IslandInteraction, Propagate, Predict,
-            Reweight, mpfjax.GaussNewtonProposal, mpfjax.RandomWalkMetropolis,
-            mpfjax.RegimeProposal, mpfjax.PropagateRegimes, mpfjax.RandomPartition,
-            PropagateIndependently, PropagateInClusters),
-    mpfjax.Prune: {"least_share": 0.1},
-    mpfjax.Partitioned: {"orders": None},
+    **alike({}, mpfjax.QuadraticModel, KMeans, mpfjax.Split, mpfjax.Prune, IslandInteraction,
+            Propagate, Predict, Reweight, mpfjax.GaussNewtonProposal, mpfjax.RandomWalkMetropolis,
+            mpfjax.RegimeProposal, mpfjax.PropagateMarginalised, mpfjax.PropagateRegimes,
+            mpfjax.Partitioned, mpfjax.RandomPartition, PropagateIndependently,
+            PropagateInClusters),
     **alike({"particles_per_component": 2}, Resample, mpfjax.GaussianRegeneration),
     **alike({"filter": FILTER}, mpfjax.with_lookahead, mpfjax.with_quasi_monte_carlo,
             mpfjax.with_score_gradient, mpfjax.with_initialisation, mpfjax.with_restarts,
@@ -158,8 +157,7 @@ SETS = {"estimates": np.ones((2, 2)), "truths": np.ones((3, 2)), "cutoff": 3.0}
 TRACKER = vision.ObjectTracker(2)
 # Those that boxes and frames come to, of which only the annotated arguments are tried.
 WITH_BOXES = {
-    vision.RGBColours: {"num_bins": 8},
-    **alike({}, vision.ObjectTracker, vision.HSVColours,
+    **alike({}, vision.ObjectTracker, vision.RGBColours, vision.HSVColours,
             vision.BackgroundSubtraction),
     **alike({"frame": FRAME, "boxes": BOXES}, vision.ColourModel.from_frame,
             vision.joint_colour_model),
@@ -228,8 +226,7 @@ def test_what_an_annotation_rules_out_is_refused_by_name(function):
 
 
 def test_every_public_call_is_tried():
-    values = (getattr(mpfjax, name) for name in dir(mpfjax) if not name.startswith("_"))
-    public = {value.__name__ for value in values if callable(value)}
+    public = {name for name in dir(mpfjax) if callable(getattr(mpfjax, name))}
     tried = {function.__name__ for function in GOOD}
     others = {name for name in public - tried if not name.startswith(("_", "Abstract"))}
     # Records of results, what takes no argument to check, and what other tests are about.
@@ -448,7 +445,8 @@ REFUSED = (
     *(
         (f"a model, but {kind.__name__} stores none; the filter has its own",
          lambda kind=kind: kind(MODEL))
-        for kind in (Propagate, mpfjax.Partitioned, mpfjax.GaussNewtonProposal, SelectInitial)
+        for kind in (Propagate, mpfjax.PropagateMarginalised, mpfjax.Partitioned,
+                     mpfjax.GaussNewtonProposal, SelectInitial)
     ),
     ("propagate: gradient 'stop'",
      lambda: mpfjax.PropagateNested(Propagate(gradient="stop"), 2)),

@@ -224,10 +224,10 @@ def test_the_eighth_column_is_a_class_for_who_says_so(tmp_path):
     path = tmp_path / "det.txt"
     path.write_text("1,-1,10,20,30,40,.9,2\n1,-1,50,20,30,40,.8,0\n")
     assert read_detections(path).shape == (2, 7)
-    assert read_detections(path, columns="classes")[:, 7].tolist() == [2, 0]
+    assert read_detections(path, with_classes=True)[:, 7].tolist() == [2, 0]
     path.write_text("1,-1,10,20,30,40,.9,2.5\n")
     with pytest.raises(ValueError, match=r"line 1: .*class"):
-        read_detections(path, columns="classes")
+        read_detections(path, with_classes=True)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])

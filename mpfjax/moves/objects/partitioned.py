@@ -56,7 +56,7 @@ class Partitioned(AbstractPropagation, AbstractWrapper):
     orders other than one or the number of components.
     """
 
-    orders: Any = eqx.field(converter=lambda orders: as_orders(orders))
+    orders: Any = eqx.field(converter=lambda orders: as_orders(orders), default=None)
     resample: Resample = eqx.field(default=Resample(allocation="equal"), kw_only=True)
     reassembly: Reassembly = eqx.field(static=True, default="evidence", kw_only=True)
 

@@ -117,7 +117,7 @@ class Prune(AbstractMove):
     if hypotheses that have become improbable occupy particles that others need.
     """
 
-    least_share: InnerShare = eqx.field(static=True)
+    least_share: InnerShare = eqx.field(static=True, default=1e-6)
     group: Groups | None = eqx.field(static=True, default=None)
 
     approximate = True

@@ -107,7 +107,7 @@ class ColourModel(AbstractStateSpaceModel):
     ) -> "ColourModel":
         """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
 
-        - `colours`: the bins of the histograms; None is `RGBColours(30)`.
+        - `colours`: the bins of the histograms; None is `RGBColours()`.
         - `deviations`: standard deviations of x_0 and of the random walk, (4,) or one row per box;
           None is the paper's, the roots of (2.5, 1.5, 0.05, 0.05).
         - `dynamics`: instead of the random walk; one for all boxes, or with a row for each.
@@ -123,7 +123,7 @@ class ColourModel(AbstractStateSpaceModel):
         """
         check_frame(frame)
         boxes = check_boxes(boxes, *frame.shape[:2])
-        colours = colour.RGBColours(30) if colours is None else colours
+        colours = colour.RGBColours() if colours is None else colours
         deviations = np.sqrt(PAPER_VARIANCES) if deviations is None else deviations
         steps = jnp.asarray(positive_deviations(deviations, len(boxes)), float)
         steps = jnp.broadcast_to(steps, (len(boxes), 4))

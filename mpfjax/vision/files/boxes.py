@@ -4,13 +4,12 @@ import codecs
 import json
 import re
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from mpfjax.arrays import to_rows
-from mpfjax.checks import checked, shown
+from mpfjax.checks import shown
 
 _COMMENTS = ("#", "%", "//")
 # The names that a header may give to the columns, in lower case and without "_".
@@ -23,12 +22,6 @@ _HEADER = re.compile(
 _LIKE_A_HEADER = re.compile(f"{_FRAME}(,[^,]*){{5}}")
 TRACK_FORM = "frame,id,x,y,w,h and one to four more columns, frames from 1 on"
 TRACK_COLUMNS = range(7, 11)
-# The number of columns of a file of detections, that of those which are read, and the form.
-_DETECTIONS = {
-    "boxes": (range(6, 11), 7, "frame,id,x,y,w,h,score and up to 3 more, as the lines before it"),
-    "classes": (range(8, 11), 8, "frame,id,x,y,w,h,score,class, from 0 on"),
-    "points": (range(4, 7), 6, "frame,id,x,y,score,class, as the lines before it"),
-}
 
 
 def parse_box(text: str) -> Float[np.ndarray, "4"]:
@@ -85,25 +78,29 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     return np.array([row[:6] for row in rows.values()])
 
 
-@checked
 def read_detections(
-    path: str | Path, *, columns: Literal["boxes", "classes", "points"] = "boxes"
+    path: str | Path, *, with_classes: bool = False, points: bool = False
 ) -> Float[np.ndarray, "rows columns"]:
     """Read a MOTChallenge file of detections into rows (frame, id, x, y, w, h, score).
 
     The id, -1 in such files, has no meaning. For a file of six columns, without scores, the result
-    has six columns too. With `columns` "classes" the eighth column is the class, an integer, 0 for
-    none, and the result has eight. With "points" the rows are (frame, id, x, y), and a score and a
-    class if there are more columns. Separators, comments and headers are as in `read_tracks`.
-    Raises `ValueError` with the file and the line for a row that cannot be parsed, has a number
-    that is not finite, is in a frame before 1, has a score if other rows have none, or an invalid
-    class; and for a file without any detection.
+    has six columns too. With `with_classes` the eighth column is the class, an integer, 0 for none,
+    and the result has eight. With `points` the rows are (frame, id, x, y), and a score and a class
+    if there are more columns. Separators, comments and headers are as in `read_tracks`. Raises
+    `ValueError` with the file and the line for a row that cannot be parsed, has a number that is
+    not finite, is in a frame before 1, has a score if other rows have none, or an invalid class;
+    and for a file without any detection.
     """
-    numbers, width, form = _DETECTIONS[columns]
-    lines = read_rows(path, form, numbers, holds="detections")
+    width, columns = 7, range(6, 11)
+    form = "frame,id,x,y,w,h,score and up to three more columns, as the lines before it"
+    if with_classes:
+        width, columns, form = 8, range(8, 11), "frame,id,x,y,w,h,score,class, from 0 on"
+    if points:
+        width, columns, form = 6, range(4, 7), "frame,id,x,y,score,class, as the lines before it"
+    lines = read_rows(path, form, columns, holds="detections")
     rows = [row[:width] for row in lines.values()]
     for number, row in zip(lines, rows, strict=True):
-        is_class = all(each >= 0 and each % 1 == 0 for each in row[5 if width == 6 else 7 :])
+        is_class = all(each >= 0 and each % 1 == 0 for each in row[5 if points else 7 :])
         if len(row) != len(rows[0]) or not np.all(np.isfinite(row)) or not is_class:
             raise ValueError(f"{path}, line {number}: {shown(row)} is not {form}")
     return np.array(rows)

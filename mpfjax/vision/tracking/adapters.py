@@ -77,7 +77,7 @@ def as_detector(detections: Any, coordinates: int) -> Detector:
     Raises `ValueError` for anything else, and for rows that are not in MOTChallenge's form.
     """
     if isinstance(detections, str | Path):
-        detections = read_detections(detections, columns="points" if coordinates == 2 else "boxes")
+        detections = read_detections(detections, points=coordinates == 2)
     if isinstance(detections, np.ndarray | jax.Array):
         return Rows(np.asanyarray(detections), coordinates=coordinates)
     is_detector = callable(detections) and not isinstance(detections, type)
