@@ -128,11 +128,11 @@ def build(
         return mpfjax.particle_filter(model, num_particles)
     regeneration = mpfjax.GaussianRegeneration(noise="stratified")
     if name == "gpf":
-        filter = mpfjax.gaussian_particle_filter(model, num_particles)
-        return mpfjax.with_resampling(filter, regeneration)
+        return mpfjax.gaussian_particle_filter(model, num_particles, regeneration=regeneration)
     if name == "gm_mpf":
-        filter = mpfjax.gaussian_mixture_particle_filter(model, num_particles, **mixture)
-        return mpfjax.with_resampling(filter, regeneration)
+        return mpfjax.gaussian_mixture_particle_filter(
+            model, num_particles, regeneration=regeneration, **mixture
+        )
     proposal = mpfjax.GaussNewtonProposal() if name == "guided_mpf" else None
     filter = mpfjax.mixture_particle_filter(model, num_particles, proposal=proposal, **mixture)
     filter = mpfjax.with_resampling(filter, mpfjax.Resample(allocation="equal"))

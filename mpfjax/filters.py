@@ -144,17 +144,17 @@ def gaussian_particle_filter(
     num_particles: Count,
     *,
     proposal: AbstractProposal | None = None,
+    regeneration: GaussianRegeneration | None = None,
     importance: Importance = "propagated",
 ) -> Filter:
     """The Gaussian particle filter: redraw from the Gaussian of the moments, propagate.
 
     Kotecha and Djuric (2003); Lin et al. (2012), section 3. It is an approximation for filtering
     distributions that are close to a Gaussian, and cannot retain two modes.
-    `gaussian_mixture_particle_filter` describes `importance`, and `with_resampling` changes the
-    draws.
+    `gaussian_mixture_particle_filter` describes `importance`.
     """
     refuse_marginalised(model, "gaussian_particle_filter")
-    redraw = GaussianRegeneration()
+    redraw = GaussianRegeneration() if regeneration is None else regeneration
     if importance == "propagated":
         return Filter(model, [redraw, Propagate(proposal)], num_particles)
     if proposal is not None:
@@ -169,6 +169,7 @@ def gaussian_mixture_particle_filter(
     max_components: Count,
     *,
     proposal: AbstractProposal | None = None,
+    regeneration: GaussianRegeneration | None = None,
     importance: Importance = "propagated",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
@@ -192,7 +193,9 @@ def gaussian_mixture_particle_filter(
     The filter is an approximation that is accurate if each mode is close to a Gaussian. Raises
     `ValueError` for another `importance`, and for "predictive_gaussian" with a `proposal`.
     """
-    plain = gaussian_particle_filter(model, num_particles, proposal=proposal, importance=importance)
+    plain = gaussian_particle_filter(
+        model, num_particles, proposal=proposal, regeneration=regeneration, importance=importance
+    )
     options = _grouping_options(model, features, scale)
     return _mixture(plain, max_components, options, _ITERATIONS, regroup, regroup_every)
 

@@ -19,7 +19,6 @@ from mpfjax.moves.initial import SelectInitial, require_propagation
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
-from mpfjax.moves.resampling.gaussian import GaussianRegeneration
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.moves.start.restart import Restart
 
@@ -53,16 +52,13 @@ def _change(
 
 
 @checked
-def with_resampling(filter: Filter, resample: Resample | GaussianRegeneration) -> Filter:
-    """The filter with this `Resample` or `GaussianRegeneration` instead of its own of that kind.
+def with_resampling(filter: Filter, resample: Resample) -> Filter:
+    """The filter with this `Resample` instead of the existing one; look-aheads are retained.
 
-    Look-aheads are retained. Raises `ValueError` for any other move. Use it to change the
-    allocation of particles to components, `with_resampling(filter, Resample(allocation="equal"))`,
-    or the draws of a Gaussian filter: `with_resampling(gaussian_particle_filter(model, 100),
-    GaussianRegeneration(noise="stratified"))`.
+    Raises `ValueError` for anything but a `Resample`. Use it to change the allocation of particles
+    to components: `with_resampling(filter, Resample(allocation="equal"))`.
     """
-    kind = Resample if isinstance(resample, Resample) else GaussianRegeneration
-    return _change(filter, kind, lambda move: resample)
+    return _change(filter, Resample, lambda move: resample)
 
 
 @checked

@@ -44,14 +44,6 @@ def test_the_score_gradient_reaches_the_resampling_inside_of_moves():
     assert (resample.gradient, partitioned.resample.gradient) == ("stop", "stop")
 
 
-def test_the_draws_of_a_gaussian_filter_are_changed_in_both_of_its_halves():
-    stratified = mpfjax.GaussianRegeneration(noise="stratified")
-    plain = mpfjax.gaussian_particle_filter(MODEL, 16, importance="predictive_gaussian")
-    changed = mpfjax.with_resampling(plain, stratified)
-    assert changed.moves[::2] == (stratified, stratified)
-    assert mpfjax.with_resampling(plain, mpfjax.Resample("stratified")).moves == plain.moves
-
-
 def test_point_sets_sort_the_chains_own_resampling_alone():
     filter = mpfjax.with_quasi_monte_carlo(
         mpfjax.auxiliary_particle_filter(MODEL, 16, PilotLookahead())
