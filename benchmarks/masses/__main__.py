@@ -37,13 +37,13 @@ REFERENCE_RUNS, LOST = 8, 0.01
 COLUMNS = {
     "filter": "{filter}",
     "N": "{N}",
-    "error of masses": "{mass_rmse:.3f} ± {mass_rmse_error:.3f}",
+    "RMSE of weights": "{mass_rmse:.3f} ± {mass_rmse_error:.3f}",
     "lost": "{lost:.2f} ± {lost_error:.2f}",
     "sd of log Ẑ": "{log_z_sd:.3f} ± {log_z_sd_error:.3f}",
     "RMSE of log Ẑ": "{log_z_rmse:.3f} ± {log_z_rmse_error:.3f}",
-    "largest mass": "{largest_mass:.2f}",
+    "largest weight": "{largest_mass:.2f}",
     "ms a step": "{ms:.3f}",
-    "worse: masses": "{masses_worse:+.1f}",
+    "worse: weights": "{masses_worse:+.1f}",
     "log Ẑ": "{log_z_worse:+.1f}",
     "lost modes": "{lost_worse:+.1f}",
 }
@@ -85,7 +85,7 @@ def main(
             )
         rows += scene_rows
         masses = ", ".join(f"{mass:.3f}" for mass in answer.masses)
-        print(f"\n{name}: masses {masses}, log Z {answer.log_z:.2f} ± {answer.log_z_error:.2f}")
+        print(f"\n{name}: weights {masses}, log Z {answer.log_z:.2f} ± {answer.log_z_error:.2f}")
         scene_rows.sort(key=lambda row: row["N"])
         print(harness.table(COLUMNS, scene_rows))
         # Programs keep memory maps, of which a process has 65 530, and no other scene needs these.
