@@ -359,11 +359,27 @@ def _density_at(
     highest = jnp.max(log_odds, axis=0)
     gaps = jnp.where(jnp.isfinite(highest), highest, 0.0)[None] - log_odds
     gaps = jnp.minimum(gaps, _FAR)
-    reach = -jax.lax.top_k(-gaps.T, min(_NEAREST, num_old))[0][:, -1] / 2
+    reach = _kth_smallest(gaps, min(_NEAREST, num_old)) / 2
     near = references * exp(-gaps / jnp.maximum(reach, 1.0)[None])
     there = jax.lax.stop_gradient(before.masses[:num_old] * detection)[:, None] * exp(-gaps)
     is_dense = jnp.sum(there, axis=0) ** 2 >= _ENOUGH * jnp.sum(there**2, axis=0)
     return before.densities @ _normalised(near), is_dense & jnp.any(there > 0, axis=0)
+
+
+def _kth_smallest(values: Float[Array, "n m"], k: int) -> Float[Array, " m"]:
+    """The k-th smallest number of each column of numbers that are not negative, in float32.
+
+    Bit by bit, the highest first. On a CPU `jax.lax.top_k` sorts, in 25 times as long.
+    """
+    bits = jax.lax.bitcast_convert_type(values.astype(jnp.float32), jnp.int32)
+
+    def refine(place: Int[Array, ""], prefix: Int[Array, " m"]) -> Int[Array, " m"]:
+        trial = prefix | (jnp.int32(1 << 30) >> place)
+        num_below = jnp.sum(bits < trial[None], axis=0, dtype=jnp.int32)
+        return jnp.where(num_below < k, trial, prefix)
+
+    prefix = jax.lax.fori_loop(0, 31, refine, jnp.zeros_like(bits[0]))
+    return jax.lax.bitcast_convert_type(prefix, jnp.float32)
 
 
 def _references(intensity: _Intensity) -> Float[Array, " p"]:
