@@ -53,8 +53,7 @@ class Sensor:
         gaps = plots - seen
         if self.origin is None:
             return gaps
-        turned = xp.arctan2(xp.sin(gaps[1]), xp.cos(gaps[1]))
-        return xp.stack([gaps[0], turned])
+        return xp.stack([gaps[0], gaps[1] - 2 * np.pi * xp.round(gaps[1] / (2 * np.pi))])
 
     @property
     def density(self) -> float:
