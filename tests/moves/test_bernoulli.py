@@ -14,7 +14,7 @@ import scipy.stats
 import mpfjax
 from mpfjax import ClutteredModel, Filter, TargetsModel
 from mpfjax.moves.objects.association import associate
-from mpfjax.moves.objects.bernoulli import TARGETS, Associate
+from mpfjax.moves.objects.bernoulli import TARGETS, Associate, _kth_smallest
 from mpfjax.moves.propagation.propagate import Predict
 from mpfjax.moves.resampling.gaussian import RegenerateObjects
 from tests.assignments import enumerated
@@ -94,6 +94,16 @@ def test_derivatives_of_associations():
     at, step = jnp.log(pairs[0, 0]), 0.02
     slope = (first(at + step) - first(at - step)) / (2 * step)
     np.testing.assert_allclose(jax.grad(first)(at), slope, rtol=0.1, atol=2e-3)
+
+
+@pytest.mark.parametrize(("n", "k"), [(40, 16), (3, 3), (16, 1)])
+def test_the_kth_smallest_is_that_of_a_sort(n, k):
+    """Also of equal numbers, of zeros and of the largest number."""
+    rng = np.random.default_rng(0)
+    values = np.exp(rng.normal(0, 8, (n, 5))).clip(max=1e6).astype(np.float32)
+    values[rng.random(values.shape) < 0.2] = 0
+    found = _kth_smallest(jnp.asarray(values), k)
+    np.testing.assert_array_equal(found, np.sort(values, axis=0)[k - 1])
 
 
 class Birth(mpfjax.AbstractBirth):
