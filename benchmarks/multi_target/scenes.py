@@ -331,15 +331,40 @@ class Spots(mpfjax.AbstractBirth):
         return spots + jnp.asarray(self.scene.deviations, noise.dtype)[None] * noise
 
     def propose(self, key: Key[Array, ""], measurement: Array, num_particles: int, sensor: int = 0):
-        """At the plot."""
-        key_place, key_rest = jax.random.split(key)
-        states = self.sample(key_rest, num_particles)
-        places, log_density = _located(self.scene.sensors[0], key_place, measurement, num_particles)
-        spots = jnp.asarray(self.scene.spots[:, PLACE], jnp.float32)
-        wide = jnp.asarray(np.take(self.scene.deviations, PLACE), jnp.float32)
-        near = jax.scipy.stats.norm.logpdf(places[:, None], spots[None], wide[None, None])
-        log_birth = jax.nn.logsumexp(near.sum(axis=2), axis=1) - jnp.log(jnp.float32(len(spots)))
-        return states.at[:, np.array(PLACE)].set(places), log_birth - log_density
+        """At a place given the plot and one of the spots, extended where it is not linear."""
+        key_spot, key_place, key_rest = jax.random.split(key, 3)
+        states, normal = self.sample(key_rest, num_particles), jax.scipy.stats.multivariate_normal
+        place, error = _place_of(self.scene.sensors[0], measurement)
+        spots = jnp.asarray(self.scene.spots[:, PLACE], place.dtype)
+        prior = jnp.diag(
+            jnp.square(jnp.asarray(self.scene.deviations, place.dtype)[np.array(PLACE)])
+        )
+        gain = prior @ jnp.linalg.inv(prior + error)
+        means, spread = spots + (place[None] - spots) @ gain.T, gain @ error
+        log_shares = jax.nn.log_softmax(normal.logpdf(spots, place, prior + error))
+        chosen = jax.random.categorical(key_spot, log_shares, shape=(num_particles,))
+        places = jax.random.multivariate_normal(key_place, means[chosen], spread)
+
+        def log_density(means: Array, covariance: Array, log_shares: Array) -> Array:
+            gaps = places[:, None] - means[None]
+            each = normal.logpdf(gaps, jnp.zeros(2, gaps.dtype), covariance)
+            return jax.nn.logsumexp(each + log_shares[None], axis=1)
+
+        log_birth = log_density(spots, prior, jnp.full_like(log_shares, -np.log(len(spots))))
+        log_proposal = log_density(means, spread, log_shares)
+        return states.at[:, np.array(PLACE)].set(places), log_birth - log_proposal
+
+
+def _place_of(sensor: Sensor, plot: Array) -> tuple[Array, Array]:
+    """Where a plot is, and the covariance of its error there."""
+    error = jnp.diag(jnp.square(jnp.asarray(sensor.deviations, plot.dtype)))
+    if sensor.origin is None:
+        return plot, error
+    r, c, s = plot[0], jnp.cos(plot[1]), jnp.sin(plot[1])
+    turn = jnp.stack([jnp.stack([c, -r * s]), jnp.stack([s, r * c])])
+    # At least 1 m in each direction, so that it has an inverse near the origin.
+    error = turn @ error @ turn.T + jnp.eye(2)
+    return jnp.stack([r * c, r * s]) + jnp.float32(sensor.origin), error
 
 
 def _located(sensor: Sensor, key: Key[Array, ""], plot: Array, n: int) -> tuple[Array, Array]:
