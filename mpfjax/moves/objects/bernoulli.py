@@ -23,7 +23,7 @@ _LEAST_EXISTENCE = 1e-4  # of an object with a component: one less probable need
 _NEAREST = 16  # undetected particles at a measurement that say how many objects to expect there
 _FAR = 1e6  # a difference of log odds beyond which particles are equally far
 _ENOUGH = 8.0  # effective particles at a measurement, from which an object may begin
-_SAME = 2.0  # pooled deviations within which two components may describe one object
+_SAME = 2.0  # variances by which two components may differ that may describe one object
 
 
 class _Intensity(NamedTuple):
@@ -69,10 +69,10 @@ class Associate(AbstractWrapper):
     undetected objects. After a `Predict`, with G_j = p_D N(y_j | x) / λ(y_j),
 
     1. Two components are merged if they describe one object that was started by different
-       measurements: their means are within two pooled standard deviations in each component of the
-       state, their r sum to at most one, and the last scan of a sensor did not start both, since an
-       object has one measurement in it. u is multiplied by p_S, and new objects are added to
-       component 0.
+       measurements: in each component of the state, the squared gap of their means and the gap of
+       their variances sum to less than twice the lesser variance, their r sum to at most one, and
+       the last scan of a sensor did not start both, since an object has one measurement in it. u is
+       multiplied by p_S, and new objects are added to component 0.
     2. Each measurement may be the first of an object. The birth model proposes its particles at the
        measurement, weighted by how many objects, new or not yet detected, there are at this place
        for each newborn one. This ratio is averaged over the particles of component 0 that are
@@ -331,8 +331,9 @@ def _once_each(
     existence = number * mixture.mixture_weights
     means = flatten_states(mixture.component_means())
     variances = jnp.diagonal(mixture.component_covariances(), axis1=1, axis2=2)
-    pooled = (variances[:, None] + variances[None]) / 2
-    pairs = jnp.all((means[:, None] - means[None]) ** 2 < _SAME**2 * pooled, axis=2)
+    least = jnp.minimum(variances[:, None], variances[None])
+    gaps = (means[:, None] - means[None]) ** 2 + jnp.abs(variances[:, None] - variances[None])
+    pairs = jnp.all(gaps < _SAME * least, axis=2)
     pairs &= existence[:, None] + existence[None] <= 1
     pairs &= (starts[:, None] != starts[None]) | (starts == 0)[None]
     pairs = jnp.triu(pairs, 1).at[0].set(False)
