@@ -299,7 +299,9 @@ def bernoulli_filter(
     is known. For a single object use a filter with `ClutteredModel`, for boxes in a video
     `vision.ObjectTracker`.
     """
-    associate = Associate(particles_per_birth, undetected_particles, RegenerateObjects())
+    associate = Associate(
+        particles_per_birth, undetected_particles, RegenerateObjects(noise="rqmc")
+    )
     return Filter(model, [Predict(proposal), associate], num_particles, max_targets + 1)
 
 

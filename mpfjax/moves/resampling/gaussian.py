@@ -58,6 +58,9 @@ class GaussianRegeneration(AbstractResampling):
     keeps_parents = False
     """a draw of a Gaussian comes from all particles of its component."""
 
+    orders_draws = True
+    """with "rqmc" noise, for a propagation with such noise."""
+
     def check(self, now: Step, num_particles: int, num_components: int) -> None:
         """Raise a `ValueError` for too few slots, and for particles that carry moments."""
         if self.where is None:
@@ -74,7 +77,7 @@ class GaussianRegeneration(AbstractResampling):
             states = eqx.tree_at(self.where, vacated.particles, states)
         redrawn = vacated.replace(particles=states, ancestor_indices=no_ancestors(vacated))
         mixture = redrawn.with_resampled_of(mixture)
-        if self.noise != "rqmc":
+        if self.noise != "rqmc" or not self.orders_draws:
             return mixture
         # The next noise is a point set over its slots.
         labels = mixture.component_indicators
@@ -129,8 +132,10 @@ class RegenerateObjects(GaussianRegeneration):
     each object, the paper's Σ_m shrinks by some percent in each step, so that the filter becomes
     overconfident. The allocation is "root": an object that exists receives some ten times as many
     slots as a false measurement, which begins one of 1e-4, and this still has enough for its
-    moments.
+    moments. Draws of "rqmc" noise are not ordered, which would take as long as the draws.
     """
+
+    orders_draws = False
 
     @property
     def _resample(self) -> Resample:
