@@ -124,10 +124,7 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         ),
         "guided mpf": _mpf(m, proposal=GaussNewtonProposal()),
         "guided, sorted": _chain(
-            Resample(along_curve=True),
-            m=m,
-            proposal=GaussNewtonProposal(),
-            then=[KMeans(2)],
+            Resample(along_curve=True), m=m, proposal=GaussNewtonProposal(), then=[KMeans(2)]
         ),
         "patient merge": _chain(Resample(), m=m, then=[Merge(2.0, max_distance=1.0, patience=2)]),
         "grouped by a label": _chain(Resample(), m=m, then=[GroupBy(_side)]),

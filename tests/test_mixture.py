@@ -127,13 +127,6 @@ def test_states_that_are_not_floats_are_averaged_as_numbers():
     np.testing.assert_allclose(np.asarray(features)[filled, 0], modes - modes.mean(), atol=1e-5)
 
 
-def test_a_stack_of_mixtures_has_no_summary_of_one(as_installed):
-    # As many as there are particles: shapes would fit.
-    stack = jax.tree.map(lambda leaf: jnp.stack([leaf] * 40), MIXTURES["ordinary"])
-    with pytest.raises(ValueError, match=r"mixture: a stack of 40 mixtures .* jax\.vmap"):
-        stack.mean()
-
-
 def test_a_variance_is_about_the_mean():
     """20 m from zero with 3 cm: E[x²] - E[x]² has no digit left, and may be negative."""
     rng = np.random.default_rng(0)

@@ -1,6 +1,5 @@
 """What figures show: the moments of components, weights, diagnostics, paths, parameters."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -91,10 +90,3 @@ def test_parameters_are_drawn_over_steps(ax):
     tuned = TuningRun(None, {"a": np.array(2.0), "b": np.ones(2)}, 0.0, history, None, None)
     plotting.draw_tuning(tuned, ax=ax)
     assert [line.get_label() for line in ax.lines] == ["a", "b[0]", "b[1]"]
-
-
-def test_what_cannot_be_drawn_is_refused(run):
-    with pytest.raises(ValueError, match="index: 9 of a state of"):
-        plotting.draw_components(run, 9)
-    with pytest.raises(ValueError, match="run: it has not the mixtures"):
-        plotting.draw_weights(eqx.tree_at(lambda r: r.collected, run, 0.0))

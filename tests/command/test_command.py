@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import mpfjax
 from mpfjax import command
 from mpfjax.command import loop as command_loop
 from mpfjax.command.loop import scores_of
@@ -182,11 +181,6 @@ print(exit_status(interrupted, [])); print(exit_status(interrupted, None))"""
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout) == (130, "130\n")
     assert ended.stderr.count("interrupted") == 2
-
-
-def test_the_version_is_said(capsys):
-    assert run(name="--version") == 0
-    assert capsys.readouterr().out == f"mpfjax {mpfjax.__version__}\n"
 
 
 def test_what_moves_is_detected(sequence, tmp_path):

@@ -196,15 +196,6 @@ def test_grid_filter_agrees_with_the_kalman_filter(parts, seen, ends):
     np.testing.assert_allclose(run.mass_above(m0), above, atol=2e-3)
 
 
-@pytest.mark.usefixtures("as_installed")
-@pytest.mark.parametrize(
-    "grid", [np.linspace(5.0, -5.0, 101), np.geomspace(0.01, 5.0, 101), np.zeros(9), np.zeros(1)]
-)
-def test_a_grid_that_is_not_even_is_refused(grid):
-    with pytest.raises(ValueError, match="grid: "):
-        grid_filter(mpfjax.QuadraticModel(), jnp.zeros(2), grid)
-
-
 @pytest.mark.exactness
 def test_the_grid_filter_is_differentiable():
     def log_evidence(sigma):

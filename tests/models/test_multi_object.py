@@ -131,12 +131,6 @@ class TestWhetherParametersAreEachObjectsOwn:
         scalars = eqx.filter_vmap(mpfjax.QuadraticModel)(deviations, deviations)
         assert MultiObjectModel(scalars, 3).per_object
 
-    def test_another_number_of_objects_is_refused(self):
-        with pytest.raises(ValueError, match="object_model: not every array"):
-            MultiObjectModel(OBJECTS[0], 3, per_object=True)
-        with pytest.raises(ValueError, match=r"observation: shape \(2, 1\) has no leading axis"):
-            MODEL.log_likelihood(OBSERVATION[:2], STATES)
-
 
 @pytest.mark.parametrize(
     ("features", "squares"),

@@ -91,19 +91,3 @@ def test_scans_with_infinities_are_the_models_or_are_counted(recwarn):
     switches = mpfjax.particle_filter(switching.MODEL, 20)
     with pytest.raises(ValueError, match="observations: infinite at index 0"):
         mpfjax.run_filter(KEY, switches, switching.OBSERVATIONS.at[0].set(jnp.inf))
-
-
-@pytest.mark.parametrize(
-    ("data", "options", "named"),
-    [
-        (Series(HOLED, present=np.arange(len(HOLED)) != 2), {}, "observations: NaN .* index 1"),
-        (
-            Series(OBSERVATIONS, INPUTS),
-            {"inputs": INPUTS},
-            "observations: a Series itself",
-        ),
-    ],
-)
-def test_what_would_be_run_as_something_else_is_refused(data, options, named):
-    with pytest.raises(ValueError, match=named):
-        mpfjax.run_filter(KEY, FILTER, data, **options)

@@ -89,23 +89,23 @@ def score(key):
     return eqx.filter_grad(value)(model)
 
 
+def trajectories(**options):
+    return of_run(
+        lambda key, filter, run: smoothing.sample_trajectories(
+            key, filter, run, 3, inputs=SERIES.inputs, **options
+        )
+    )
+
+
+def sums(key, filter, run):
+    return smoothing.smoothed_sums(key, filter, SERIES, lambda before, now: now).sums
+
+
 PROGRAMS = {
-    "trajectories": of_run(
-        lambda key, filter, run: smoothing.sample_trajectories(
-            key, filter.model, run, 3, inputs=SERIES.inputs
-        )
-    ),
-    "trajectories, mcmc": of_run(
-        lambda key, filter, run: smoothing.sample_trajectories(
-            key, filter.model, run, 3, inputs=SERIES.inputs, method="mcmc"
-        )
-    ),
+    "trajectories": trajectories(),
+    "trajectories, mcmc": trajectories(method="mcmc"),
     "genealogy": of_run(lambda key, filter, run: smoothing.trace_ancestors(run).trajectories),
-    "sums": of_run(
-        lambda key, filter, run: (
-            smoothing.smoothed_sums(key, filter, SERIES, lambda before, now: now).sums
-        )
-    ),
+    "sums": of_run(sums),
     "a gradient": score,
 }
 

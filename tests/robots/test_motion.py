@@ -22,15 +22,6 @@ def test_steps_of_poses_that_moved_far_enough():
     assert robots.odometry_steps(turning, 0.25, 0.2)[1].tolist() == [2, 5]
 
 
-@pytest.mark.parametrize(
-    "function",
-    [robots.odometry_steps, lambda poses: robots.interpolated_poses([0.5], [0, 1], poses)],
-)
-def test_headings_in_degrees_are_refused(function):
-    with pytest.raises(ValueError, match=r"poses: a turn of 90 .* in radians"):
-        function(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 90.0]]))
-
-
 def test_a_way_along_headings_in_degrees_is_refused():
     """Each turn is less than 2π; in radians the same way passes, however often it goes round."""
     turns = np.linspace(0, 6 * np.pi, 600)

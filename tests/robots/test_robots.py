@@ -265,7 +265,9 @@ def test_a_robot_is_in_no_wall_and_may_be_where_the_map_is_unknown():
         ("initial_pose: .*occupied cell", lambda: robot(initial_pose=(1.2, 3.0, 0.0))),
         ("initial_pose: .*radians", lambda: robot(initial_pose=(0.5, 2.55, 90.0))),
         ("initial_pose: .*finite", lambda: robot(initial_pose=(0.5, 2.55, np.nan))),
-        ("poses: .*radians", lambda: robots.odometry_steps(90 * np.eye(3))),
+        ("poses: a turn of 90 .* in radians", lambda: robots.odometry_steps(90 * np.eye(3))),
+        ("poses: a turn of 90 .* in radians", lambda: robots.interpolated_poses(
+            [0.5], [0, 1], np.array([[0.0, 0, 0], [0.1, 0, 90]]))),
         ("min_distance, min_turn: ", lambda: robots.odometry_steps(np.eye(3), 0.25)),
         ("times: not all", lambda: robots.interpolated_poses([3.5], [0.0, 1.0, 3.0], np.eye(3))),
         ("pose_times: ", lambda: robots.interpolated_poses([0.5], [0.0, 1.0, 1.0], np.eye(3))),

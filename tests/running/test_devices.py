@@ -87,11 +87,6 @@ class TestIslands:
                 assert (dead[1:] >= dead[:-1]).all()
         assert (dead[:-1] & ~dead[1:]).any()
 
-    def test_slots_that_cannot_be_dealt_evenly(self):
-        filter = mpfjax.Filter(MODEL, [IslandInteraction(), mpfjax.Propagate()], 13)
-        with pytest.raises(ValueError, match=r"num_particles: 13 of an island.* 2 islands"):
-            mpfjax.run_islands(jax.random.key(0), filter, OBSERVATIONS, num_islands=2)
-
 
 class TestExchange:
     def exchanged(self, threshold, log_masses, n=24):

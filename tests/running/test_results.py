@@ -86,12 +86,6 @@ def test_variance_of_a_marginalised_state_holds_that_within_particles():
         run.quantile(0.5)
 
 
-def test_moments_need_the_mixtures():
-    run = mpfjax.run_filter(jax.random.key(0), FILTER, SEEN, lambda mixture: mixture.mean())
-    with pytest.raises(ValueError, match="collect: the run did not collect its mixtures"):
-        run.mean()
-
-
 def test_a_table_shows_the_living_components_alone(run):
     table = mpfjax.component_table(run.final)
     weights = np.asarray(run.final.mixture_weights)

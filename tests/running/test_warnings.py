@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.scipy.stats import norm
 
 import mpfjax
-from tests.user_models import Drift
+from tests.user_models import Drift, ScalarLinear
 
 
 class Near(Drift):
@@ -48,24 +47,13 @@ def test_a_run_in_which_one_particle_has_all_weight_says_so_once(recwarn):
         mpfjax.monte_carlo(keys, filter, mpfjax.Series.skipping(1000 * seen))
 
 
-class Slow(mpfjax.AbstractStateSpaceModel):
-    """A walk whose steps are much shorter than a jump."""
-
-    def sample_initial(self, key, num_particles):
-        return 0.1 * jax.random.normal(key, (num_particles,))
-
-    def sample_transition(self, key, states):
-        return states + 0.01 * jax.random.normal(key, states.shape)
-
-    def log_likelihood(self, observation, states):
-        return norm.logpdf(observation, states, 0.05)
-
-
+# A walk whose steps are much shorter than a jump.
+SLOW = ScalarLinear(a=1.0, q=0.01, r=0.05, m=0.0, p=0.1)
 JUMP = np.where(np.arange(40) < 20, 0.0, 2.0) + 0.05 * np.sin(np.arange(40.0))
 
 
 def test_runs_that_lost_the_state_are_counted_from_the_step_on(recwarn):
-    filter, keys = mpfjax.particle_filter(Slow(), 50), jax.random.split(jax.random.key(0), 3)
+    filter, keys = mpfjax.particle_filter(SLOW, 50), jax.random.split(jax.random.key(0), 3)
     mpfjax.monte_carlo(keys, filter, JUMP[:20])
     mpfjax.run_filter(keys[0], filter, JUMP[:24])  # too early to say
     assert not recwarn.list
@@ -79,7 +67,7 @@ def test_runs_that_lost_the_state_are_counted_from_the_step_on(recwarn):
 def test_a_state_that_is_found_again_is_not_lost(recwarn):
     """As after a short excursion; and a sharp likelihood alone is no loss."""
     back = np.where((np.arange(40) >= 10) & (np.arange(40) < 22), 0.5, 0.0)
-    key, filter = jax.random.key(0), mpfjax.particle_filter(Slow(), 50)
+    key, filter = jax.random.key(0), mpfjax.particle_filter(SLOW, 50)
     mpfjax.run_filter(key, filter, back)
     sharp = mpfjax.LinearGaussianModel([[0.9]], [[1.0]], [[1.0]], [[1e-3]], [0.0], [[1.0]])
     _, observations = mpfjax.simulate(jax.random.key(1), sharp, 60)

@@ -10,6 +10,7 @@ from mpfjax import Filter, KMeans, Merge, Propagate, RandomPartition, Resample, 
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.smoothing import conditional_filter
 from tests.marking import quick_of
+from tests.user_models import ScalarLinear
 
 NUM_RUNS = 1000
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
@@ -84,32 +85,19 @@ def test_exact_draws_stay_exact_and_much_is_new(name):
     np.testing.assert_array_equal(ancestors, slots[:, :-1])
 
 
-class Walled(mpfjax.AbstractStateSpaceModel):
-    """Steps below zero, and starts above one, are impossible."""
-
-    def sample_initial(self, key, num_particles):
-        return jax.random.uniform(key, (num_particles,))
-
-    def sample_transition(self, key, states):
-        return states + jax.random.uniform(key, states.shape)
+class Walled(ScalarLinear):
+    """Steps below zero, and observations farther than one, are impossible."""
 
     def log_likelihood(self, observation, states):
         return jnp.where(jnp.abs(observation - states) < 1, 0.0, -jnp.inf)
 
     def log_transition(self, states, previous_states):
-        step = states - previous_states
-        return jnp.where((step >= 0) & (step < 1), 0.0, -jnp.inf)
-
-    def log_initial(self, states):
-        return jnp.where((states >= 0) & (states < 1), 0.0, -jnp.inf)
+        return jnp.where(states >= previous_states, 0.0, -jnp.inf)
 
 
-ONES = np.ones(3, np.float32)
-
-
-def call(trajectory=(0.5, 0.6, 0.7, 0.8), n=6, observations=ONES):
-    filter, path = mpfjax.particle_filter(Walled(), n), jnp.asarray(trajectory, jnp.float32)
-    return conditional_filter(jax.random.key(0), filter, observations, path)
+def call(trajectory):
+    filter, path = mpfjax.particle_filter(Walled(), 6), jnp.asarray(trajectory, jnp.float32)
+    return conditional_filter(jax.random.key(0), filter, np.ones(3, np.float32), path)
 
 
 @pytest.mark.parametrize(

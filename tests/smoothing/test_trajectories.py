@@ -212,8 +212,7 @@ def test_variances_are_about_the_mean_however_far_from_zero(method):
 LINEAR = mpfjax.LinearGaussianModel(
     A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]]
 )
-SEEN = jnp.array([[0.8], [0.1], [-0.4]])
-NUM_STEPS = 3
+SEEN = jnp.array([[0.8], [0.1], [1.5]])
 
 
 class ObservedDrift(DriftOfOne):
@@ -234,23 +233,18 @@ def test_a_wrapped_models_observations_are_drawn_one_by_one():
 
 
 @pytest.mark.exactness
-def test_predictions_are_the_kalman_filters():
-    """Of states and observations before each observation, and later ones; weights are unequal."""
-    seen, filter = SEEN.at[-1].set(1.5), mpfjax.particle_filter(LINEAR, 20_000)
-    run = mpfjax.run_filter(jax.random.key(1), filter, seen)
-    each_step = mpfjax.one_step_predictions(jax.random.key(2), filter, run)
-    later = forecast(jax.random.key(3), filter, run.final, NUM_STEPS)
-    unknown = jnp.concatenate([seen, jnp.full((NUM_STEPS, 1), jnp.nan)])
-    exact = kalman_filter(LINEAR, mpfjax.Series.skipping(unknown))
+def test_predicted_observations_are_the_kalman_filters():
+    """Before each is seen, of particles of unequal weights; states are asked in the matrix."""
+    filter = mpfjax.particle_filter(LINEAR, 20_000)
+    run = mpfjax.run_filter(jax.random.key(1), filter, SEEN)
+    ahead = mpfjax.one_step_predictions(jax.random.key(2), filter, run)
+    exact = kalman_filter(LINEAR, SEEN)
     before = jnp.concatenate([jnp.array([0.5]), exact.means[:-1, 0]])
-    spread = 0.81 * jnp.concatenate([jnp.ones(1), exact.covariances[:-1, 0, 0]]) + 0.3
-    ahead = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), each_step, later)
-    moments = jax.vmap(lambda mixture, x: (mixture.expectation(x)[0], mixture.variance(x)[0]))
+    spread = 0.81 * jnp.concatenate([jnp.ones(1), exact.covariances[:-1, 0, 0]]) + 0.3 + 0.4
+    moments = jax.vmap(lambda mixture, y: (mixture.expectation(y)[0], mixture.variance(y)[0]))
+    mean, variance = moments(ahead.mixtures, ahead.observations)
     size = run.effective_sample_size.min()
-    for values, noise in ((ahead.mixtures.particles, 0.0), (ahead.observations, 0.4)):
-        mean, variance = moments(ahead.mixtures, values)
-        error = np.sqrt((spread + noise) / size)
-        assert np.all(np.abs(mean - 0.9 * before) < 4 * error)
-        np.testing.assert_allclose(variance, spread + noise, rtol=4 * np.sqrt(2 / size))
+    assert np.all(np.abs(mean - 0.9 * before) < 4 * np.sqrt(spread / size))
+    np.testing.assert_allclose(variance, spread, rtol=4 * np.sqrt(2 / size))
     with pytest.raises(ValueError, match="run: it has not the mixtures of one run"):
         mpfjax.one_step_predictions(jax.random.key(2), filter, replace(run, collected=None))

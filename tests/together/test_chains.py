@@ -16,13 +16,7 @@ from mpfjax.exact import grid_filter
 from tests.marking import quick_of
 from tests.registry import CHAINS, NUM_PARTICLES, QUICK_CHAINS
 from tests.unbiased import assert_unbiased
-from tests.user_models import (
-    BLINDED,
-    BROKEN,
-    EXPLODING,
-    TrickyQuadraticModel,
-    nothing_traced,
-)
+from tests.user_models import BLINDED, BROKEN, EXPLODING, TrickyQuadraticModel, nothing_traced
 
 NUM_RUNS = 4000
 OBSERVATIONS = jnp.array([1.5, 1.0, 0.4, 0.9])

@@ -13,9 +13,7 @@ import pytest
 
 import mpfjax
 from mpfjax import metrics
-from mpfjax.arrays import (
-    to_array,
-)
+from mpfjax.arrays import to_array
 from mpfjax.checks import as_numbers
 from mpfjax.exact import kalman_filter
 from mpfjax.models.series import check_differences

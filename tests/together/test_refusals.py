@@ -39,6 +39,7 @@ from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.moves.regrouping.merge import Exclusion
 from mpfjax.running.islands import IslandInteraction
 from mpfjax.smoothing.variance import batch_estimate, log_marginal_likelihood_variance
+from mpfjax.tuning.evidence import pose_evidence
 from tests.marking import weekly
 from tests.user_models import Batched, Drift, DriftOfOne, ScalarLinear
 
@@ -51,6 +52,7 @@ FILTER = mpfjax.particle_filter(MODEL, 4)
 MIXTURE = FILTER.init(KEY)
 TWO, THREE = np.ones(2, np.float32), np.ones(3, np.float32)
 HISTORY = mpfjax.run_filter(KEY, FILTER, TWO)
+UNCOLLECTED = mpfjax.run_filter(KEY, FILTER, TWO, lambda mixture: None)
 EYE, ZERO = np.eye(1), np.zeros(1)
 LINEAR = {"A": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": ZERO, "P0": EYE}
 PARTS = {"transition_matrix": EYE, "F": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": ZERO, "P0": EYE}
@@ -154,7 +156,7 @@ FRAME = np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8)
 BOXES = np.array([[5.0, 5, 10, 20], [20, 10, 10, 15]])
 ROWS = np.array([[1.0, 1, 2, 2, 5, 5], [2, 1, 2, 2, 5, 5]])
 SETS = {"estimates": np.ones((2, 2)), "truths": np.ones((3, 2)), "cutoff": 3.0}
-TRACKER = vision.ObjectTracker(2)
+TRACKER, POINTS = vision.ObjectTracker(2), vision.ObjectTracker(4, point_deviation=1.0)
 # Those that boxes and frames come to, of which only the annotated arguments are tried.
 WITH_BOXES = {
     **alike({}, vision.ObjectTracker, vision.RGBColours, vision.HSVColours,
@@ -329,6 +331,7 @@ def around(filter=FILTER, trajectory=THREE):
 SCALAR = ScalarLinear()
 OF_SCALAR = mpfjax.particle_filter(SCALAR, 4)
 ASCENT = optax.sgd(0.1)
+PROPOSING = mpfjax.particle_filter(MODEL, 4, proposal=mpfjax.NetworkProposal.create(KEY, 1, 1, 0.8))
 OF_A = {"parameters": {"a": lambda filter: filter.model.a}, "progress": False}
 
 
@@ -366,6 +369,11 @@ REFUSED = (
     # observations
     (r"observations: shapes .* jnp.asarray\(observations\)", lambda: run(FILTER, [0.0, 1.0])),
     (r"observation: shape \(2,\)", lambda: run(FILTER, jnp.zeros((3, 2)))),
+    ("observations: NaN .* index 1", lambda: run(
+        FILTER, mpfjax.Series(np.array([1.0, NAN, 2.0]), present=np.arange(3) != 2))),
+    ("observations: a Series itself", lambda: run(FILTER, mpfjax.Series(TWO, TWO), inputs=TWO)),
+    (r"num_particles: 13 of an island.* 2 islands", lambda: mpfjax.run_islands(
+        KEY, Filter(MODEL, [IslandInteraction(), Propagate()], 13), TWO, num_islands=2)),
     # what a model's methods return
     ("model: DriftOfOne.sample_initial.*per_particle",
      lambda: mpfjax.particle_filter(DriftOfOne(), 10)),
@@ -402,9 +410,18 @@ REFUSED = (
         for R in ([[1, 0.5], [0, 1]], [[1, 2], [2, 1]])
     ),
     ("high: 1.0 is not above low", lambda: mpfjax.QuadraticModel(low=1.0, high=1.0)),
+    *(
+        ("grid: ", lambda grid=grid: exact.grid_filter(MODEL, TWO, grid))
+        for grid in (np.linspace(5, -5, 101), np.geomspace(0.01, 5, 101), np.zeros(9), np.zeros(1))
+    ),
     (r"observations: shape \(2,\) is not \(t, 1\)",
      lambda: exact.kalman_filter(mpfjax.LinearGaussianModel(**LINEAR), TWO)),
-    # scores
+    # summaries, figures and scores
+    (r"mixture: a stack of 4 mixtures .* jax\.vmap",
+     lambda: jax.tree.map(lambda leaf: jnp.stack([leaf] * 4), MIXTURE).mean()),
+    ("collect: the run did not collect its mixtures", lambda: UNCOLLECTED.mean()),
+    ("run: it has not the mixtures", lambda: plotting.draw_weights(UNCOLLECTED)),
+    ("index: 9 of a state of", lambda: plotting.draw_components(HISTORY, 9)),
     ("weights: shape", lambda: metrics.crps(np.ones((2, 3)), np.ones((2, 4)), TWO)),
     (r"observations: shape \(3,\) is not \(2\)",
      lambda: metrics.crps(np.ones((2, 3)), np.ones((2, 3)), THREE)),
@@ -427,6 +444,8 @@ REFUSED = (
             ("classes .* whole numbers from 0", (BOXES, None, [-1, 1])),
         )
     ),
+    ("detections: frame 1", lambda: POINTS.step(None, POINTS.init(), None, np.zeros((3, 4)))),
+    ("frame,id,x,y,score", lambda: next(vision.track(None, np.ones((3, 9)), POINTS))),
     ("detections: end before the frames do, at frame 2", lambda: tracked([BOXES])),
     ("min_score: .* no scores", lambda: tracked([BOXES] * 2, min_score=0.5)),
     ("frames: None; .* 'pixels'", lambda: vision.track(None, ROWS, camera_motion="pixels")),
@@ -456,6 +475,10 @@ REFUSED = (
         mpfjax.Every(2, [IslandInteraction()]), mpfjax.RandomWalkMetropolis()], 4)),
     ("object_model: .* is conditionally linear",
      lambda: mpfjax.ClutteredModel(SWITCHING, 0.9, 0.1)),
+    ("object_model: not every array",
+     lambda: mpfjax.MultiObjectModel(mpfjax.LinearGaussianModel(**LINEAR), 3, per_object=True)),
+    (r"observation: shape \(2,\) has no leading axis",
+     lambda: mpfjax.MultiObjectModel(MODEL, 3).log_likelihood(TWO, jnp.ones((4, 3)))),
     ("orders: ", lambda: mpfjax.partitioned_sampling(JOINT, 10, (0, 0))),
     ("orders: 2 of them, for 1 components",
      lambda: run(Filter(JOINT, [mpfjax.Partitioned([(0, 1), (1, 0)])], 4))),
@@ -490,6 +513,17 @@ REFUSED = (
     ("transforms: b is not among", lambda: climb(transforms={"b": tuning.Positive()})),
     ("parameters: a, 0.9, is outside Interval",
      lambda: climb(transforms={"a": tuning.Interval(2.0, 3.0)})),
+    ('score: "fisher" has no derivative in .* proposal', lambda: pose_evidence(
+        PROPOSING, TWO, {"w": lambda filter: filter.moves[1].proposal.network}, None, "fisher")),
+    ("observations: sequence 1 has none", lambda: pose_evidence(
+        FILTER, [TWO, mpfjax.Series.skipping(NAN * TWO)], None, None, "fisher")),
+    *(
+        (f"models: .*{named}", lambda models=models: tuning.compare_evidence(models))
+        for named, models in (
+            ("are not two", {"a": [1.0, 2.0]}), ("b has", {"a": [1.0, 2.0], "b": [1.0, NAN]}),
+            ("b has .* not two finite", {"a": [1.0, 2.0], "b": [1.0]}),
+        )
+    ),
     ("parameters: x and y pick the same",
      lambda: climb(parameters=dict.fromkeys("xy", lambda filter: filter.model.a))),
 )  # fmt: skip

@@ -56,17 +56,6 @@ class Returns(mpfjax.AbstractStateSpaceModel):
         return jnp.exp(states / 2) * jax.random.normal(key, states.shape)
 
 
-class Ranged(Returns):
-    """A place whose error grows with its distance, on either side."""
-
-    def log_likelihood(self, observation, states):
-        return norm.logpdf(observation, states, 0.1 + 0.4 * jnp.abs(states))
-
-    def sample_observation(self, key, states):
-        noise = jax.random.normal(key, states.shape)
-        return states + (0.1 + 0.4 * jnp.abs(states)) * noise
-
-
 class Plotted(Observed):
     """A place in the plane, by its range and bearing."""
 
@@ -256,7 +245,6 @@ RIGHT = {
     "batched": (Drift(), NUMBER),
     "observed": (Observed(), NUMBER),
     "returns": (Returns(), NUMBER),
-    "ranged": (Ranged(), NUMBER),
     "objects": (radar(polar), PLOTS),
     "x_0 known": (Known(), NUMBER),
     "regimes": (Regimes(), NUMBER),
@@ -355,10 +343,6 @@ PLANTED = {
     "a variance": (Observed, "log_likelihood", lambda self, y, x: norm.logpdf(y, x[:, 0], 0.49)),
     "another number": (Observed, "log_likelihood", lambda self, y, x: norm.logpdf(y, x[:, 1], 0.7)),
     "no normaliser": (Returns, "log_likelihood", lambda self, y, x: squared(jnp.exp(x / 2))(y, 0)),
-    "no normaliser of a distance": (
-        Ranged, "log_likelihood",
-        lambda self, y, x: squared(0.1 + 0.4 * jnp.abs(x))(y, x),
-    ),
     "a variance for a scale": (
         Returns, "log_likelihood", lambda self, y, x: norm.logpdf(y, 0, jnp.exp(x)),
     ),

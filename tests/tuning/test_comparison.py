@@ -39,19 +39,6 @@ def test_of_several_runs_the_evidence_is_the_mean_of_their_estimates():
     assert shifted.differences["b"] == pytest.approx(found.differences["b"], rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("models", "named"),
-    [
-        ({"a": [1.0, 2.0]}, "not two models|are not two"),
-        ({"a": [1.0, 2.0], "b": [1.0]}, "b has .* not two finite"),
-        ({"a": [1.0, 2.0], "b": [1.0, np.nan]}, "b has"),
-    ],
-)
-def test_what_cannot_be_compared_is_refused(models, named):
-    with pytest.raises(ValueError, match=rf"models: .*({named})"):
-        compare_evidence(models)
-
-
 def run_of(key, r=0.5, num_samples=600, num_steps=8):
     series = Series.skipping(OBSERVATIONS[:num_steps], INPUTS[:num_steps])
     return smc2(

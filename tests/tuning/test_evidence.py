@@ -47,20 +47,3 @@ def test_the_score_by_fishers_identity_is_exact_without_any_gradient_of_the_move
     for n, name in names.items():
         exact = score(LAW, OBSERVATIONS, INPUTS, name)
         assert_unbiased(ratios * (np.asarray(slopes[n], float) - exact), 0.0, loosest=0.1)
-
-
-def test_parameters_of_a_proposal_have_no_score_by_fishers_identity():
-    proposal = mpfjax.NetworkProposal.create(KEY, 1, 1, 0.8)
-    filter = mpfjax.particle_filter(Pushed(), 4, proposal=proposal)
-    parameters = {"w": lambda filter: filter.moves[1].proposal.network}
-    with pytest.raises(ValueError, match=r'score: "fisher" has no derivative in .* proposal'):
-        pose_evidence(filter, SERIES, parameters, None, "fisher")
-
-
-def test_a_sequence_without_observations_is_refused_by_fishers_identity():
-    """The derivative of the likelihood of a missing observation is not a number."""
-    filter = mpfjax.particle_filter(Pushed(), 4)
-    nothing = mpfjax.Series.skipping(np.full(8, np.nan), SERIES.inputs)
-    pose_evidence(filter, [SERIES, nothing], None, None)
-    with pytest.raises(ValueError, match="observations: sequence 1 has none"):
-        pose_evidence(filter, [SERIES, nothing], None, None, "fisher")

@@ -33,9 +33,7 @@ class Normal(ScalarLinear):
 
 
 class Fragile(Normal):
-    """A likelihood that breaks where its deviation falls below 0.3, and a parameter to no end."""
-
-    idle: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
+    """A likelihood that breaks where its deviation falls below 0.3."""
 
     def log_likelihood(self, observation, states):
         honest = super().log_likelihood(observation, states)

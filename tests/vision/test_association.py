@@ -5,12 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from mpfjax.vision.tracking.associate import (
-    mahalanobis,
-    marginals,
-    one_to_one,
-    probabilities,
-)
+from mpfjax.vision.tracking.associate import mahalanobis, marginals, one_to_one, probabilities
 from mpfjax.vision.tracking.gaussian import Gaussian, overlapping
 from mpfjax.vision.tracking.pairs import Pairs
 from tests.assignments import enumerated

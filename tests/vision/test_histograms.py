@@ -1,7 +1,6 @@
 """Integral histograms against NumPy's own, on boxes inside, across and outside the frame."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -86,18 +85,6 @@ def test_a_box_without_pixels_is_empty_and_lies_farthest(frame, box):
     np.testing.assert_array_equal(np.asarray(counts), 0)
     reference = normalise(counted(table, jnp.asarray([(30.0, 20.0, 20.0, 20.0)]), 2))
     np.testing.assert_array_equal(np.asarray(bhattacharyya(normalise(counts), reference)), 1.0)
-
-
-def test_the_table_is_built_once_for_all_runs(frame):
-    boxes = jnp.asarray(random_boxes(6)).reshape(2, 3, 4)
-
-    def count(frame, boxes):
-        return integral_histogram(frame, RGBColours(8), False).counts(boxes, 1)
-
-    program = jax.make_jaxpr(jax.vmap(count, in_axes=(None, 0)))(jnp.asarray(frame), boxes)
-    (build,) = [e for e in program.jaxpr.eqns if "table" in str(e.params.get("name"))]
-    # Rows, columns and colours, without an axis of runs.
-    assert [len(variable.aval.shape) for variable in build.outvars] == [3]
 
 
 # --- from a grid of points in each box ---------------------------------------------------------

@@ -41,14 +41,6 @@ def test_points_among_false_ones_in_any_unit(scale):
     assert false / 60 < 1
 
 
-def test_what_points_are_is_said_in_errors():
-    tracker = ObjectTracker(4, point_deviation=1.0)
-    with pytest.raises(ValueError, match="detections: frame 1"):
-        tracker.step(None, tracker.init(), None, np.zeros((3, 4)))
-    with pytest.raises(ValueError, match=r"frame,id,x,y,score"):
-        next(track(None, np.ones((3, 9)), tracker))
-
-
 def right_after_a_meeting(crosses, with_vectors, seed):
     """Whether two who walk up to each other and stand together keep their identities after it.
 

@@ -340,12 +340,15 @@ def test_drawn_boxes_give_one_track_each_in_the_order_given():
 
 def test_frames_move_objects_by_the_time_between_them():
     """One that walks steadily, seen at 10 and 2.5 frames a second by turns, never out of sight."""
-    times = np.cumsum([0.1, 0.4] * 12)
-    boxes = [np.array([[60 * time, 20.0, 30.0, 60.0]]) for time in times]
+    since = np.cumsum([0.1, 0.4] * 12)
+    boxes, times = [np.array([[60 * time, 20.0, 30.0, 60.0]]) for time in since], 1.7e9 + since
     tracker = ObjectTracker(3, frames_per_second=10)
     # In the last frame no detector ran, and it is predicted.
     *_, before, ahead = track(None, [*boxes[:-1], None], tracker, times=times)
     assert before.identities.tolist() == [1]
-    assert ahead.corner_boxes[0, 0] == pytest.approx(60 * times[-1], abs=3)
-    with pytest.raises(ValueError, match="time: "):
+    assert ahead.corner_boxes[0, 0] == pytest.approx(60 * since[-1], abs=3)
+    times[-1] = times[-2] + 1.2  # more than a second without a detection
+    *_, lost = track(None, [*boxes[:-1], boxes[0][:0]], tracker, times=times)
+    assert len(lost.identities) == 0
+    with pytest.raises(ValueError, match=r"time: .* s is not after"):
         list(track(None, boxes, tracker, times=times[::-1]))

@@ -175,11 +175,11 @@ def test_nothing_leaks_over_many_random_frames():
 # --- frames without a detector, dropped frames, long covers -----------------------------------
 
 
-def steps(tracker, found, time=None):
+def steps(tracker, found):
     """The tracks of each frame."""
     state, tracks = tracker.init(), []
-    for boxes, at in zip(found, time or [None] * len(found), strict=True):
-        state, now = tracker.step(None, state, None, boxes, time=at)
+    for boxes in found:
+        state, now = tracker.step(None, state, None, boxes)
         tracks.append(now)
     return tracks
 
@@ -199,21 +199,6 @@ def test_a_frame_on_which_the_detector_did_not_run_is_not_one_in_which_nothing_i
     assert not all(each.shown.any() for each in nobody)
     gone = steps(tracker, [*boxes[:30], *[None] * 60, np.zeros((0, 4))])
     assert [len(each.identities) for each in gone[-2:]] == [1, 0]  # a detector ran
-
-
-def test_the_time_of_a_frame_is_as_many_frames():
-    """Of 25 frames a second every fifth comes: the place is predicted as far, at the given time."""
-    tracker = ObjectTracker(M, frames_per_second=25)
-    walk = [np.array([[20.0 + 3 * t, 50, 20, 40]]) for t in range(80)]
-    chosen = [*range(30), *range(30, 80, 5)]
-    times = [1.7e9 + t / 25 for t in chosen]  # since 1970, in float64
-    tracks = steps(tracker, [walk[t] for t in chosen], time=times)
-    assert all(each.identities.tolist() == [1] for each in tracks)
-    np.testing.assert_allclose(tracks[-1].corner_boxes, walk[chosen[-1]], atol=0.5)
-    lost = steps(tracker, [*walk[:30], np.zeros((0, 4))], time=[*times[:30], times[29] + 1.2])
-    assert len(lost[-1].identities) == 0  # a second has passed
-    with pytest.raises(ValueError, match=r"time: 3.0 s is not after"):
-        steps(tracker, walk[:2], time=[3.0, 3.0])
 
 
 @pytest.mark.exactness
