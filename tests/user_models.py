@@ -16,13 +16,9 @@ from jax.scipy.stats import norm
 import mpfjax
 
 DRIFT_AS_LINEAR_GAUSSIAN = mpfjax.LinearGaussianModel(
-    A=jnp.array([[1.0, 0.5], [0.0, 0.8]]),
-    Q=0.25 * jnp.eye(2),
-    H=jnp.array([[1.0, 0.0]]),
-    R=jnp.array([[0.49]]),
-    m0=jnp.zeros(2),
+    A=[[1.0, 0.5], [0.0, 0.8]], Q=0.25 * jnp.eye(2), H=[[1.0, 0.0]], R=[[0.49]], m0=[0.0, 0.0],
     P0=jnp.eye(2),
-)
+)  # fmt: skip
 
 
 class Drift(mpfjax.AbstractStateSpaceModel):
@@ -155,6 +151,14 @@ class ScalarLinear(mpfjax.AbstractStateSpaceModel):
             A=rows(self.a), Q=rows(self.q**2), H=rows(self.h), R=rows(self.r**2),
             m0=self.m.reshape(1), P0=rows(self.p**2),
         )  # fmt: skip
+
+
+class Window(mpfjax.QuadraticModel):
+    """Zero likelihood, with a logarithm of -inf, for most of the particles."""
+
+    def log_likelihood(self, observation, states):
+        honest = super().log_likelihood(observation, states)
+        return jnp.where(jnp.abs(observation - states**2) < 0.4, honest, -jnp.inf)
 
 
 # Observations at which the model below misbehaves, as a broken model would.

@@ -20,13 +20,9 @@ NUM_OBJECTS = 3
 
 def linear_gaussian(mean, noise):
     return mpfjax.LinearGaussianModel(
-        A=jnp.array([[0.9, 0.1], [0.0, 0.8]]),
-        Q=0.3 * jnp.eye(2),
-        H=jnp.array([[1.0, 0.5]]),
-        R=jnp.array([[noise]]),
-        m0=jnp.array([mean, -mean]),
-        P0=jnp.eye(2),
-    )
+        A=[[0.9, 0.1], [0.0, 0.8]], Q=0.3 * jnp.eye(2), H=[[1.0, 0.5]], R=[[noise]],
+        m0=[mean, -mean], P0=jnp.eye(2),
+    )  # fmt: skip
 
 
 OBJECTS = [linear_gaussian(m, r) for m, r in ((0.0, 0.5), (3.0, 0.8), (-4.0, 1.5))]

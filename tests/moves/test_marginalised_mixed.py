@@ -13,11 +13,8 @@ from tests.unbiased import assert_unbiased
 # The whole state (z, x) is linear: z_t = f z + A x + v, x_t = F x + B z + w.
 SLOPE, COUPLING = 0.7, np.array([[0.5, -0.3]])
 MATRIX, PUSH = np.array([[0.9, 0.3], [-0.2, 0.8]]), np.array([0.2, -0.1])
-OWN, NOISE, SHARED = (
-    np.array([[0.3]]),
-    np.array([[0.4, 0.1], [0.1, 0.3]]),
-    np.array([[0.15], [-0.1]]),
-)
+OWN, SHARED = np.array([[0.3]]), np.array([[0.15], [-0.1]])
+NOISE = np.array([[0.4, 0.1], [0.1, 0.3]])
 SEEN, ERROR = np.array([[0.5, 1.0, 0.2]]), np.array([[0.3]])
 OBSERVATIONS = jnp.array([[0.5], [1.2], [-0.4], [-1.0], [0.8]])
 NUM_RUNS, NUM_PARTICLES = 1000, 40

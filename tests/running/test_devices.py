@@ -23,6 +23,7 @@ from mpfjax.running.islands import IslandInteraction
 from tests import on_devices
 from tests.examples import AT_START, make_mixture
 from tests.precision import float64
+from tests.user_models import Window
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 MODEL = on_devices.quadratic()
@@ -52,14 +53,6 @@ def test_eight_devices_give_the_numbers_of_one(tmp_path):
 # --- islands -------------------------------------------------------------------------------------
 
 
-class Cliff(mpfjax.QuadraticModel):
-    """Particles far from explaining the observation have no likelihood at all."""
-
-    def log_likelihood(self, observation, states):
-        near = jnp.abs(states**2 - observation) < 0.3
-        return jnp.where(near, 0.0, -jnp.inf)
-
-
 class TestIslands:
     @pytest.mark.exactness
     def test_an_exchange_revives_islands_without_any_likelihood(self):
@@ -68,7 +61,7 @@ class TestIslands:
         def mass(mixture):
             return mixture.log_mass
 
-        model = Cliff(0.3, 0.5, -2.0, 2.0)
+        model = Window(0.3, 0.5, -2.0, 2.0)
         for exchange in (IslandInteraction(0.0), IslandInteraction(1.0)):
             moves = [mpfjax.Resample(), mpfjax.Propagate(), exchange]
             run = mpfjax.run_islands(

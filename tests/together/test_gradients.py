@@ -12,19 +12,11 @@ import pytest
 import mpfjax
 from mpfjax import Filter, Propagate, Resample, with_score_gradient
 from tests.marking import weekly
-from tests.user_models import BLINDED, ScalarLinear
+from tests.user_models import BLINDED, ScalarLinear, Window
 
 NUM_PARTICLES = 48
 MODEL = ScalarLinear()
 ONE = jnp.array([[1.5], [1.0], [0.4], [0.9]])
-
-
-class Window(mpfjax.QuadraticModel):
-    """Zero likelihood, with a logarithm of -inf, for most of the particles."""
-
-    def log_likelihood(self, observation, states):
-        honest = super().log_likelihood(observation, states)
-        return jnp.where(jnp.abs(observation - states**2) < 0.4, honest, -jnp.inf)
 
 
 @pytest.mark.exactness

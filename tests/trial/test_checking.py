@@ -6,19 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
-from jax.scipy.special import logsumexp
 from jax.scipy.stats import cauchy, norm, poisson
 
 import mpfjax
 from tests import switching
 from tests.marking import quick_of, weekly
-from tests.user_models import (
-    DRIFT_AS_LINEAR_GAUSSIAN,
-    Drift,
-    DriftOfOne,
-    ScalarLinear,
-    TwoSensors,
-)  # fmt: skip
+from tests.user_models import DRIFT_AS_LINEAR_GAUSSIAN, Drift, DriftOfOne, ScalarLinear, TwoSensors
 
 NUMBER = jnp.asarray(0.3)
 ONE = mpfjax.LinearGaussianModel(A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]])
@@ -162,18 +155,13 @@ class Step(mpfjax.AbstractStateSpaceModel):
 class BirthsAndDeaths(mpfjax.AbstractStateSpaceModel):
     """An object that walks, dies in one step of 200 and is born in one of 50, anywhere."""
 
-    death: float = 0.005
-    birth: float = 0.02
-
     def sample_initial(self, key, num_particles):
         place = 10 * jax.random.normal(key, (num_particles,))
         return {"alive": jnp.ones(num_particles, bool), "place": place}
 
     def sample_transition(self, key, states):
         keys, (alive, place) = jax.random.split(key, 3), states.values()
-        changes = jax.random.uniform(keys[0], place.shape) < jnp.where(
-            alive, self.death, self.birth
-        )
+        changes = jax.random.uniform(keys[0], place.shape) < jnp.where(alive, 0.005, 0.02)
         walked = place + 0.1 * jax.random.normal(keys[1], place.shape)
         born = 10 * jax.random.normal(keys[2], place.shape)
         now = alive != changes
@@ -181,28 +169,13 @@ class BirthsAndDeaths(mpfjax.AbstractStateSpaceModel):
 
     def log_transition(self, states, previous_states):
         (now, place), (alive, before) = states.values(), previous_states.values()
-        chance = jnp.where(alive, self.death, self.birth)
+        chance = jnp.where(alive, 0.005, 0.02)
         mean, deviation = jnp.where(alive, before, 0.0), jnp.where(alive, 0.1, 10.0)
         log_place = jnp.where(now, norm.logpdf(place, mean, deviation), 0.0)
         return jnp.log(jnp.where(now == alive, 1 - chance, chance)) + log_place
 
     def log_likelihood(self, observation, states):
         return jnp.where(states["alive"], norm.logpdf(observation, states["place"], 10.0), -5.0)
-
-
-def jumped(chance, size):
-    """A walk with seldom jumps."""
-
-    def draw(key, x):
-        keys = jax.random.split(key, 2)
-        scale = jnp.where(jax.random.bernoulli(keys[0], chance, x.shape), size, 0.1)
-        return x + scale * jax.random.normal(keys[1], x.shape)
-
-    def log_density(x, old):
-        of_each = [norm.logpdf(x, old, scale) for scale in (size, 0.1)]
-        return logsumexp(jnp.stack(of_each), 0, b=jnp.array([[chance], [1 - chance]]))
-
-    return Step(draw, log_density)
 
 
 def chain(*rows):
@@ -218,8 +191,12 @@ def chain(*rows):
     return Step(draw, lambda z, old: logs[old, z], start)
 
 
+JUMPS = mpfjax.RandomWalkWithJumps([0.1], [5.0], 0.01)
 STEPS = {
-    "seldom jumps": jumped(0.01, 5.0),
+    "seldom jumps": Step(
+        lambda key, x: JUMPS.sample(key, x[:, None], x[:, None])[:, 0],
+        lambda x, old: JUMPS.log_density(x[:, None], old[:, None], old[:, None]),
+    ),
     "a sticky chain": chain([0.999, 0.001], [0.01, 0.99]),
     "heavy tails": Step(
         lambda key, x: 0.5 * x + jax.random.cauchy(key, x.shape),

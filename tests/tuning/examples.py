@@ -15,7 +15,8 @@ from tests.user_models import ScalarLinear
 OBSERVATIONS = jnp.array([1.5, 0.2, jnp.nan, 0.8, 1.9, 1.1, 0.3, -0.9])
 INPUTS = jnp.array([0.6, -0.7, 0.2, 0.9, -0.3, 0.5, -0.8, 0.1])
 SERIES = mpfjax.Series.skipping(OBSERVATIONS, INPUTS)
-MEAN_OF_A, DEVIATION_OF_A = 0.3, 0.5
+PRIOR = 0.3, 0.5
+"""The mean and the deviation of a."""
 LAW = Law(b=1.0)
 """That of `Pushed`, for exact answers."""
 A = {"a": lambda filter: filter.model.a}
@@ -40,11 +41,11 @@ class Pushed(ScalarLinear):
 
 
 def sample_a(key):
-    return {"a": MEAN_OF_A + DEVIATION_OF_A * jax.random.normal(key)}
+    return {"a": PRIOR[0] + PRIOR[1] * jax.random.normal(key)}
 
 
 def log_prior_of_a(parameters):
-    return norm.logpdf(parameters["a"], MEAN_OF_A, DEVIATION_OF_A)
+    return norm.logpdf(parameters["a"], *PRIOR)
 
 
 def eager_mixture(num_particles=10):

@@ -3,23 +3,12 @@
 import jax
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 import mpfjax
 from mpfjax import Series
 from mpfjax.tuning import compare_evidence, smc2
 from tests.matrix.law import kalman
-from tests.tuning.examples import (
-    DEVIATION_OF_A,
-    INPUTS,
-    LAW,
-    MEAN_OF_A,
-    OBSERVATIONS,
-    A,
-    Pushed,
-    log_prior_of_a,
-    sample_a,
-)
+from tests.tuning.examples import INPUTS, LAW, OBSERVATIONS, A, Pushed, log_prior_of_a, sample_a
 
 
 def test_of_several_runs_the_evidence_is_the_mean_of_their_estimates():
@@ -61,7 +50,7 @@ def exact_log_evidence(r):
     """Of the mean likelihood over the prior of a, on a grid."""
     grid = np.linspace(-1.7, 2.3, 201)
     logs = [kalman(LAW._replace(a=a, r=r), OBSERVATIONS, INPUTS).log_z for a in grid]
-    return np.logaddexp.reduce(logs + norm.logpdf(grid, MEAN_OF_A, DEVIATION_OF_A)) + np.log(0.02)
+    return np.logaddexp.reduce(logs + np.asarray(log_prior_of_a({"a": grid}))) + np.log(0.02)
 
 
 @pytest.mark.exactness

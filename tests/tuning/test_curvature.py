@@ -30,8 +30,7 @@ def exact_errors(names):
         model = ScalarLinear(**numbers).in_matrices()
         return kalman_filter(model, OBSERVATIONS[:, None]).log_marginal_likelihood
 
-    hessian = jax.hessian(log_evidence)(jnp.array([TRUTH[name] for name in names]))
-    information = -np.asarray(hessian, float)
+    information = -jax.hessian(log_evidence)(jnp.array([TRUTH[name] for name in names]))
     assert np.linalg.eigvalsh(information)[0] > 0
     return np.sqrt(np.diag(np.linalg.inv(information)))
 

@@ -10,14 +10,7 @@ import mpfjax
 from mpfjax import Checkpoint, Series
 from mpfjax.tuning import Positive, smc2
 from mpfjax.tuning import sequential as observing
-from tests.tuning.examples import (
-    DEVIATION_OF_A,
-    MEAN_OF_A,
-    OBSERVATIONS,
-    A,
-    log_prior_of_a,
-    sample_a,
-)
+from tests.tuning.examples import OBSERVATIONS, PRIOR, A, log_prior_of_a, sample_a
 from tests.user_models import ScalarLinear
 
 SERIES = Series.skipping(OBSERVATIONS)
@@ -61,7 +54,7 @@ def sample_log_normal(key):
 @pytest.mark.parametrize(
     ("log_prior", "sample_prior"),
     [
-        (lambda p: norm.logpdf(p["a"], MEAN_OF_A, DEVIATION_OF_A**2), sample_a),
+        (lambda p: norm.logpdf(p["a"], PRIOR[0], PRIOR[1] ** 2), sample_a),
         (lambda p: -log_prior_of_a(p), sample_a),
         (lambda p: log_prior_of_a({"a": jnp.log(p["a"])}), sample_log_normal),
     ],
