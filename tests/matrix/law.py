@@ -80,11 +80,12 @@ def score(law, y, u, name, answer=kalman):
     return (above - below) / (2 * step)
 
 
-def posterior(law, y, u, name="c", answer=kalman):
-    """Mean and variance of one of the law's numbers under a standard normal prior."""
+def posterior(law, y, u, name="c", answer=kalman, prior=(0.0, 1.0)):
+    """Mean and variance of one of the law's numbers under a normal prior of such moments."""
     grid = np.linspace(-6.0, 6.0, 2401)
-    logs = [answer(law._replace(**{name: x}), y, u).log_z - 0.5 * x**2 for x in grid]
-    shares = np.exp(np.array(logs) - max(logs))
+    logs = np.array([answer(law._replace(**{name: x}), y, u).log_z for x in grid])
+    logs -= 0.5 * ((grid - prior[0]) / prior[1]) ** 2
+    shares = np.exp(logs - max(logs))
     shares /= shares.sum()
     mean = shares @ grid
     return mean, shares @ (grid - mean) ** 2

@@ -383,7 +383,7 @@ def log_prior(parameters):
 
 
 def sampler(run):
-    """The posterior of c under a standard normal prior, over chains."""
+    """Mean and variance of c under a standard normal prior, over the chains or runs."""
 
     def ask(row, data):
         case, form = row.case(data), row.form
@@ -397,10 +397,12 @@ def sampler(run):
             "sample_prior": sample_prior,
             "progress": False,
         }
-        found = run(row, data, options)
+        draws, weights = run(row, data, options)
         mean, variance = exact.posterior(case.law, case.y, case.u, answer=form.answer)
-        gaps = (np.asarray(found, float) - mean) / np.sqrt(variance)
-        assert_unbiased(gaps, 0.0, loosest=0.15)
+        gaps = (np.reshape(draws, weights.shape).astype(float) - mean) / np.sqrt(variance)
+        for power, moment in ((1, 0.0), (2, 1.0)):
+            values = np.average(gaps**power, axis=1, weights=weights)
+            assert_unbiased(values, moment, loosest=0.15 * power)
 
     return ask
 
@@ -411,10 +413,9 @@ WALK: dict[str, Any] = {"log_prior": log_prior, "proposal_deviations": 0.8}
 def of_chains(method, row, data, **options):
     case = row.case(data)
     posterior = method(
-        KEYS[0], row.filter(data), case.series, 40, num_chains=60, burn_in=10, **options
+        KEYS[0], row.filter(data), case.series, 40, num_chains=60, burn_in=30, **options
     )
-    draws = np.asarray(posterior.parameters["c"], float)
-    return draws.reshape(*draws.shape[:2], -1)[..., 0].mean(axis=1)
+    return posterior.parameters["c"], np.ones((60, 40))
 
 
 @sampler
@@ -430,8 +431,8 @@ def gibbs(row, data, options):
 @sampler
 def smc2(row, data, options):
     keys, data = jax.random.split(jax.random.key(1), 8), (row.filter(data), row.case(data).series)
-    found = [tuning.smc2(key, *data, 120, log_prior=log_prior, **options).mean("c") for key in keys]
-    return np.reshape(found, (8, -1))[:, 0]
+    runs = [tuning.smc2(key, *data, 120, log_prior=log_prior, **options) for key in keys]
+    return [run.parameters["c"] for run in runs], np.array([run.weights for run in runs])
 
 
 def fisher(row, data):

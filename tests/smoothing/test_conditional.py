@@ -12,7 +12,7 @@ from mpfjax.smoothing import conditional_filter
 from tests.marking import quick_of
 from tests.user_models import ScalarLinear
 
-NUM_RUNS = 1000
+NUM_RUNS = 10_000
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
 PRESENT = np.array([True, True, False, True, True])
 EAGER = (Merge(2.0), Split(1.0, min_distance=0.1, min_share=0.0), KMeans(2))

@@ -234,27 +234,15 @@ RIGHT = {
 }
 
 
-QUICK = [
-    "x_0 known", "births and deaths", "returns", "of one particle", "quadratic", "matrices",
-]  # fmt: skip
+CASES = quick_of([(name, 8) for name in RIGHT], [], one_in=2)
+CASES += weekly([(name, 1000) for name in RIGHT])
 
 
-def is_accepted(name, num_keys, recwarn):
-    """With so many keys, without a warning."""
+@pytest.mark.parametrize(("name", "num_keys"), CASES)
+def test_what_is_right_is_accepted(name, num_keys, recwarn):
     for seed in range(num_keys):
         mpfjax.check_model(jax.random.key(seed), *RIGHT[name])
-    return not recwarn.list
-
-
-@pytest.mark.exactness
-@pytest.mark.parametrize("name", quick_of(RIGHT, QUICK, one_in=3))
-def test_what_is_right_is_accepted(name, recwarn):
-    assert is_accepted(name, 8, recwarn)
-
-
-@pytest.mark.parametrize("name", weekly(RIGHT))
-def test_what_is_right_is_accepted_with_any_key(name, recwarn):
-    assert is_accepted(name, 1000, recwarn)
+    assert not recwarn.list
 
 
 def normal(x, mean, scale):

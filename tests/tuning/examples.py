@@ -54,3 +54,15 @@ def eager_mixture(num_particles=10):
     regrouping = [Merge(2.0), Split(1.0, min_distance=0.1, min_share=0.0), KMeans(2)]
     moves = [Resample(), Propagate(), *regrouping]
     return Filter(model, moves, num_particles, 3, initial_moves=[KMeans(2, reseed=True)])
+
+
+def interrupt(monkeypatch, module, name, when):
+    """Ctrl-C where a function of a module is called with arguments for which this is true."""
+    real = getattr(module, name)
+
+    def interrupted(*arguments):
+        if when(*arguments):
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(module, name, interrupted)

@@ -10,6 +10,7 @@ import mpfjax
 from mpfjax import Checkpoint
 from mpfjax.tuning import chains as chains_of
 from mpfjax.tuning import metropolis_hastings
+from tests.tuning.examples import interrupt
 from tests.user_models import ScalarLinear
 
 COVARIANCE = np.array([[1.0, 0.9 * 0.05], [0.9 * 0.05, 0.05**2]])
@@ -70,16 +71,8 @@ class TestLearning:
 WHOLE = {"burn_in": 9, "sample_prior": dispersed}
 
 
-def interrupt_after(monkeypatch, steps):
-    """Ctrl-C once so many steps are made."""
-    real = chains_of._steps
-
-    def interrupted(kernel, key, chains, numbers):
-        if int(numbers[0]) >= steps:
-            raise KeyboardInterrupt
-        return real(kernel, key, chains, numbers)
-
-    monkeypatch.setattr(chains_of, "_steps", interrupted)
+def after(steps):
+    return lambda kernel, key, chains, numbers: int(numbers[0]) >= steps
 
 
 def assert_same_draws(one, other):
@@ -92,11 +85,11 @@ def test_interrupted_anywhere_the_draws_are_those_of_one_run(tmp_path, monkeypat
     """In the burn-in, where nothing is lost, and after it, where the draws so far come back."""
     whole, file = blind(15, **WHOLE), Checkpoint(tmp_path / "chains.npz", 4)
     with monkeypatch.context() as patch:
-        interrupt_after(patch, 5)
+        interrupt(patch, chains_of, "_steps", after(5))
         with pytest.raises(KeyboardInterrupt):
             blind(15, checkpoint=file, **WHOLE)
     with monkeypatch.context() as patch:
-        interrupt_after(patch, 14)
+        interrupt(patch, chains_of, "_steps", after(14))
         with pytest.warns(UserWarning, match=r"interrupted at step \d+ of 24"):
             part = blind(15, checkpoint=file, **WHOLE)
     draws = part.parameters["a"].shape[1]

@@ -10,7 +10,7 @@ import mpfjax
 from mpfjax import Checkpoint, Series
 from mpfjax.tuning import Positive, smc2
 from mpfjax.tuning import sequential as observing
-from tests.tuning.examples import OBSERVATIONS, PRIOR, A, log_prior_of_a, sample_a
+from tests.tuning.examples import OBSERVATIONS, PRIOR, A, interrupt, log_prior_of_a, sample_a
 from tests.user_models import ScalarLinear
 
 SERIES = Series.skipping(OBSERVATIONS)
@@ -80,25 +80,13 @@ def assert_same_samples(one, other):
     np.testing.assert_array_equal(one.log_weights, other.log_weights)
 
 
-def interrupt_at(monkeypatch, step):
-    """Ctrl-C at an observation."""
-    real = observing.extend
-
-    def interrupted(sampler, key, samples, t):
-        if int(t) == step:
-            raise KeyboardInterrupt
-        return real(sampler, key, samples, t)
-
-    monkeypatch.setattr(observing, "extend", interrupted)
-
-
 @pytest.mark.weekly
 def test_interrupted_and_resumed_the_samples_are_those_of_one_run(tmp_path, monkeypatch):
     """Also to observations that were not there before."""
     whole, file = sample(), Checkpoint(tmp_path / "samples.npz", every=3)
     assert np.isfinite(whole.acceptance_rates).any()
     with monkeypatch.context() as patch:
-        interrupt_at(patch, 5)
+        interrupt(patch, observing, "extend", lambda sampler, key, samples, t: int(t) == 5)
         with pytest.warns(UserWarning, match="interrupted at step 5 of 8"):
             some = sample(checkpoint=file)
     assert some.stopped == "interrupted at step 5 of 8"
