@@ -94,9 +94,8 @@ TARGETS = {
 GOOD = {
     **alike({}, mpfjax.QuadraticModel, KMeans, mpfjax.Split, mpfjax.Prune, IslandInteraction,
             Propagate, Predict, Reweight, mpfjax.GaussNewtonProposal, mpfjax.RandomWalkMetropolis,
-            mpfjax.RegimeProposal, mpfjax.PropagateMarginalised, mpfjax.PropagateRegimes,
-            mpfjax.Partitioned, mpfjax.RandomPartition, PropagateIndependently,
-            PropagateInClusters),
+            mpfjax.RegimeProposal, mpfjax.PropagateRegimes, mpfjax.Partitioned,
+            mpfjax.RandomPartition, PropagateIndependently, PropagateInClusters),
     **alike({"particles_per_component": 2}, Resample, mpfjax.GaussianRegeneration),
     **alike({"filter": FILTER}, mpfjax.with_lookahead, mpfjax.with_quasi_monte_carlo,
             mpfjax.with_score_gradient, mpfjax.with_initialisation, mpfjax.with_restarts,
@@ -231,13 +230,14 @@ def test_every_public_call_is_tried():
     public = {name for name in dir(mpfjax) if callable(getattr(mpfjax, name))}
     tried = {function.__name__ for function in GOOD}
     others = {name for name in public - tried if not name.startswith(("_", "Abstract"))}
-    # Records of results, what takes no argument to check, and what other tests are about.
+    # Records of results, what takes no argument to check, what other tests are about, and another
+    # name of `Propagate`.
     assert others == {
         "FilterRun", "Step", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
         "NetworkProposal", "enable_compilation_cache", "check_model", "simulate", "map_moves",
         "TargetEstimates", "estimate_targets", "track_table", "number_distribution",
-        "ComponentTable", "component_table", "one_step_predictions",
+        "ComponentTable", "component_table", "one_step_predictions", "PropagateMarginalised",
     }  # fmt: skip
 
 
@@ -464,8 +464,7 @@ REFUSED = (
     *(
         (f"a model, but {kind.__name__} stores none; the filter has its own",
          lambda kind=kind: kind(MODEL))
-        for kind in (Propagate, mpfjax.PropagateMarginalised, mpfjax.Partitioned,
-                     mpfjax.GaussNewtonProposal, SelectInitial)
+        for kind in (Propagate, mpfjax.Partitioned, mpfjax.GaussNewtonProposal, SelectInitial)
     ),
     ("propagate: gradient 'stop'",
      lambda: mpfjax.PropagateNested(Propagate(gradient="stop"), 2)),
