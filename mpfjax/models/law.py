@@ -122,6 +122,14 @@ class Law:
         """The states updated by y_t, and the factors of log L(y_t | x_t) of each particle."""
         return states, [self.log_likelihood_of_draws(observation, states)]
 
+    def observe(self, key: Key[Array, ""], states: PyTree) -> PyTree:
+        """y_t of each particle, drawn by the model's `sample_observation`."""
+        with asking(self.model, "sample_observation"):
+            observations = self.model.sample_observation(key, states)
+        number = jax.tree.leaves(states)[0].shape[0]
+        check_states(observations, self.model, "sample_observation", number)
+        return observations
+
 
 def law_of(model: Any) -> Law:
     """The law of this model."""

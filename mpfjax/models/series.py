@@ -11,14 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Key, PyTree
 
 from mpfjax.checks import Count, array_of_numbers, check, check_shape, checked, warn
-from mpfjax.models.base import (
-    AbstractStateSpaceModel,
-    asking,
-    check_states,
-    innermost,
-    require,
-    with_inputs,
-)
+from mpfjax.models.base import AbstractStateSpaceModel, innermost, require, with_inputs
 from mpfjax.models.law import Law
 from mpfjax.models.observations import (
     NOT_FINITE,
@@ -252,11 +245,9 @@ def steps_ahead(
     def advance(state: PyTree, step: tuple[Array, PyTree]) -> tuple[PyTree, tuple[PyTree, PyTree]]:
         step_key, now = step
         key_state, key_observation = jax.random.split(step_key)
-        at_step = with_inputs(model, now)
-        moved = Law(at_step).draw(key_state, state)
-        with asking(at_step, "sample_observation"):
-            observation = at_step.sample_observation(key_observation, moved)
-        check_states(observation, model, "sample_observation", 1)
-        return moved, jax.tree.map(lambda leaf: leaf[0], (moved, observation))
+        law = Law(with_inputs(model, now))
+        moved = law.draw(key_state, state)
+        drawn = moved, law.observe(key_observation, moved)
+        return moved, jax.tree.map(lambda leaf: leaf[0], drawn)
 
     return jax.lax.scan(advance, state, (jax.random.split(key, num_steps), inputs))[1]

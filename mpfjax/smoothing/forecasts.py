@@ -4,10 +4,11 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import Count, check_one_each, checked
+from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import with_inputs
+from mpfjax.models.law import law_of
 from mpfjax.models.series import steps_of_inputs
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.running.results import FilterRun
@@ -103,8 +104,6 @@ def _one_ahead(
     key_step, key_observation = jax.random.split(key)
     mixture, _ = filter._step(key_step, mixture, inputs=inputs)
     model, observations = with_inputs(filter.model, inputs), None
-    simulate = getattr(model, "sample_observation", None)
-    if callable(simulate):
-        observations = simulate(key_observation, mixture.particles)
-        check_one_each(mixture.num_particles, sample_observation=observations)
+    if callable(getattr(model, "sample_observation", None)):
+        observations = law_of(model).observe(key_observation, mixture.particles)
     return Forecast(mixture, observations)

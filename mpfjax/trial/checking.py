@@ -115,25 +115,26 @@ def _draw(key, model, now):
     All are of one program, of few calls of each method, since compiling takes most of the time.
     """
     keys = jax.random.split(key, 6)
-    drawn: dict[str, PyTree] = {"many x_0": _of_many_keys(_initial, keys[0], model, _DRAWS)}
-    law, draws = law_of(now), model.sample_initial(keys[1], _DENSITY_DRAWS)
+    law, draw_initial = law_of(now), law_of(model).sample_initial
+    drawn: dict[str, PyTree] = {"many x_0": _of_many_keys(draw_initial, keys[0], _DRAWS)}
+    draws = model.sample_initial(keys[1], _DENSITY_DRAWS)
     initial = law.start(draws)
     if callable(getattr(model, "log_initial", None)):
         drawn["x_0"], drawn["log_initial"] = draws, law_of(model).log_initial(draws)
     starts = _rows(initial, slice(_FAMILIES))
     places = _repeat(_rows(starts, slice(_PLACES)), _DRAWS)
-    drawn["many x_1"] = _of_many_keys(_move, keys[2], now, places)
+    drawn["many x_1"] = _of_many_keys(law.move, keys[2], places)
     groups = [_rows(initial, slice(_FAMILIES * _SIBLINGS)), _repeat(starts, _SIBLINGS)]
     has_density = is_mixed(model) or callable(getattr(model, "log_transition", None))
     if has_density:
         groups.append(_repeat(_rows(starts, slice(_PLACES)), _DENSITY_DRAWS))
     before = jax.tree.map(lambda *parts: jnp.concatenate(parts), *groups)
-    after, number = _move(keys[3], now, before), _FAMILIES * _SIBLINGS
+    after, number = law.move(keys[3], before), _FAMILIES * _SIBLINGS
     drawn["x_1"] = _rows(after, slice(0, number, _SIBLINGS // _DRAWS))
     families = _in_families(_rows(after, slice(2 * number)))
     siblings = drawn["siblings"] = _rows(families, slice(_FAMILIES, None))
     if has_density:
-        children = law.part(_move(keys[4], now, _side_by_side(siblings)))
+        children = law.part(law.move(keys[4], _side_by_side(siblings)))
         starts, ends = (_rows(each, slice(2 * number, None)) for each in (before, after))
         drawn["x_1 of places"] = ends = law.part(ends)
         drawn["log_transition"] = law.log_transition(ends, starts)
@@ -144,30 +145,15 @@ def _draw(key, model, now):
         drawn["origins of x_2"] = _log_densities(log_transition, _in_families(children), siblings)
     if callable(getattr(model, "sample_observation", None)) and law.is_whole:
         same = _repeat(_rows(after, slice(_PLACES)), _DRAWS)
-        drawn["many y_1"] = _of_many_keys(_observe, keys[5], now, same)
-        observations = _in_families(_observe(keys[5], now, _side_by_side(families)))
+        drawn["many y_1"] = _of_many_keys(law.observe, keys[5], same)
+        observations = _in_families(law.observe(keys[5], _side_by_side(families)))
         drawn["families"] = families
         drawn["origins of y_1"] = _log_densities(law.log_likelihood, observations, families)
     return drawn
 
 
-def _initial(key: Key[Array, ""], model: Any, number: int) -> PyTree:
-    return law_of(model).sample_initial(key, number)
-
-
-def _move(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:
-    return law_of(model).move(key, states)
-
-
-def _observe(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:
-    with base.asking(model, "sample_observation"):
-        observations = model.sample_observation(key, states)
-    base.check_states(observations, model, "sample_observation", len(jax.tree.leaves(states)[0]))
-    return observations
-
-
-def _of_many_keys(draw: Callable[..., PyTree], key: Key[Array, ""], model: Any, of: Any) -> PyTree:
-    return jax.vmap(lambda key: draw(key, model, of))(jax.random.split(key, _KEYS))
+def _of_many_keys(draw: Callable[..., PyTree], key: Key[Array, ""], of: Any) -> PyTree:
+    return jax.vmap(lambda key: draw(key, of))(jax.random.split(key, _KEYS))
 
 
 def _rows(states: PyTree, which: Any) -> PyTree:
@@ -295,7 +281,7 @@ def _of_origins(
 @_jit
 def _of_proposal(key, model, now, proposal):
     """Draws of a proposal from each of a few x_0, and log q."""
-    starts = _initial(jax.random.fold_in(key, 1), model, _PLACES)
+    starts = law_of(model).sample_initial(jax.random.fold_in(key, 1), _PLACES)
     draws, logs = proposal.propose(key, now, _repeat(starts, _DENSITY_DRAWS))
     return now.law.part(draws), logs
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import Count, checked
 from mpfjax.models.base import require, with_inputs
-from mpfjax.models.law import refuse_marginalised
+from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.models.series import Series, steps_ahead, steps_of_inputs
 from mpfjax.moves.base import check_keep_parents
 from mpfjax.operations.compiling import jit_on_wide_vectors
@@ -253,7 +253,7 @@ def _observe(problem, inputs, keys, values, paths):
 
         def observe(key: Array, now: PyTree, state: PyTree) -> PyTree:
             alone = jax.tree.map(lambda leaf: leaf[None], state)
-            observation = with_inputs(model, now).sample_observation(key, alone)
+            observation = law_of(with_inputs(model, now)).observe(key, alone)
             return jax.tree.map(lambda leaf: leaf[0], observation)
 
         return jax.vmap(observe)(keys, inputs, after)
