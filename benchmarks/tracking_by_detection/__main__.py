@@ -15,6 +15,7 @@ rendered, and the detections simulated. One run's scores scatter: --jitters take
 in which the detections' places and sizes are off by 1% of a box.
 """
 
+import itertools
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -185,20 +186,20 @@ def runs_of(
 
 def ours(sequence: Sequence, least: float | None, camera_motion: Motion | None) -> Run:
     """One run; the camera's motion is that of the options where there are pixels."""
-    rows = Rows(sequence.rows, last=sequence.last)
+    rows, length = Rows(sequence.rows), sequence.last - sequence.first + 1
     tracker = vision.ObjectTracker(
         rows.most_objects(), frames_per_second=sequence.frames_per_second
     )
     clock, stills = Clock("read", "track"), sequence.stills()
     tracked = vision.track(
-        None if stills is None else clock.over("read", stills), rows, tracker,
+        itertools.repeat(None, length) if stills is None else clock.over("read", stills),
+        rows, tracker,
         first=sequence.first, min_score=least,
         frame_size=sequence.frame_size, camera_motion=None if stills is None else camera_motion,
     )  # fmt: skip
     kept, compiling = [], 0.0
     steps = tqdm(
-        clock.over("track", tracked),
-        total=sequence.last - sequence.first + 1, desc=OURS, disable=None,
+        clock.over("track", tracked), total=length, desc=OURS, disable=None,
     )  # fmt: skip
     for tracks in steps:
         kept.append(online_rows(tracks))

@@ -2,6 +2,7 @@
 
 import collections
 import contextlib
+import itertools
 import sys
 import time
 from argparse import Namespace
@@ -56,7 +57,7 @@ def _start(options: Namespace, source: Source, still: np.ndarray | None) -> Star
         return lambda stills: follow_boxes(stills or (), boxes, key=key, first=source.first)
     rows, deviation = None, options.point_deviation
     if source.rows is not None:
-        rows = Rows(source.rows, last=source.last, coordinates=4 if deviation is None else 2)
+        rows = Rows(source.rows, coordinates=4 if deviation is None else 2)
     tracker = ObjectTracker(
         options.max_objects or (LEAST_ROOM if rows is None else rows.most_objects()),
         frames_per_second=source.frames_per_second,
@@ -72,7 +73,9 @@ def _start(options: Namespace, source: Source, still: np.ndarray | None) -> Star
         "use_colours": not options.no_colour, "ahead": source.has_pixels,
         "camera_motion": "detections" if options.detect else options.camera_motion,
     }  # fmt: skip
-    return lambda stills: track(stills, detections, tracker, **settings)
+    # Up to the last frame, also where its detections end before.
+    no_pixels = itertools.repeat(None, source.num_frames or 0)
+    return lambda stills: track(stills or no_pixels, detections, tracker, **settings)
 
 
 def _track(options: Namespace, source: Source, start: Start, tracks: list[Tracks]) -> None:

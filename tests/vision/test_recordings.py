@@ -1,5 +1,7 @@
 """Bars on recordings of real scenes, where they are there: scores of TrackEval, in hundredths."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -17,9 +19,11 @@ def scores_of(folder):
     rows, truth = read_detections(folder / "det.txt"), read_truth(folder / "gt.txt")
     info = read_sequence_info(folder)
     last = last_frame(info, rows, truth.objects)
-    found = Rows(rows, last=last)
+    found = Rows(rows)
     tracker = ObjectTracker(found.most_objects(), frames_per_second=info.frame_rate)
-    tracked = track(None, found, tracker, frame_size=info.size)
+    first = int(found.frames[0])
+    frames = itertools.repeat(None, last - first + 1)
+    tracked = track(frames, found, tracker, first=first, frame_size=info.size)
     rows = np.concatenate([online_rows(tracks) for tracks in tracked])
     away = {"ignored": truth.ignored, "min_height": truth.min_height}
     found = multi_object_scores(rows, truth.objects, **away)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mpfjax.arrays import to_rows
-from mpfjax.checks import CountOrZero, checked, is_series, saying, shown, warn
+from mpfjax.checks import is_series, saying, shown, warn
 from mpfjax.vision.files.boxes import read_detections
 from mpfjax.vision.tracking.detections import Detections
 
@@ -26,18 +26,10 @@ class Rows:
     Where there are eight columns, the last is the class, as `read_detections` has it. Points have
     two coordinates in the place of four, without w and h.
 
-    Frames count from 1; in a frame without rows nothing is there. Without pixels `last` is the last
-    frame, by default that of the last row.
+    Frames count from 1; in a frame without rows nothing is there.
     """
 
-    @checked
-    def __init__(
-        self,
-        rows: Float[np.ndarray, "r columns"],
-        *,
-        last: CountOrZero | None = None,
-        coordinates: int = 4,
-    ) -> None:
+    def __init__(self, rows: Float[np.ndarray, "r columns"], *, coordinates: int = 4) -> None:
         self._score = 2 + coordinates
         most = self._score + (4 if coordinates == 4 else 2)
         if rows.ndim != 2 or not (rows.size == 0 or self._score <= rows.shape[1] <= most):
@@ -50,8 +42,6 @@ class Rows:
             raise ValueError(f"{named} is of no frame; they count from 1")
         self._rows = rows[np.argsort(rows[:, 0], kind="stable")]
         self.frames = self._rows[:, 0].astype(int)
-        self.is_limited = last is not None
-        self.last = int(self.frames.max(initial=0)) if last is None else last
 
     def get(self, number: int) -> Detections:
         """The detections of a frame."""
@@ -97,8 +87,7 @@ def first_step(detector: Detector, first: int | None, frames_per_second: float) 
     """The number of the first frame where there are no pixels: that of the first row, if not given.
 
     Frame numbers decide how many steps there are: those of several clips, or times, would make many
-    of nothing. Raises `ValueError` for a row that comes more than a minute after the one before it,
-    unless the last frame is given.
+    of nothing. Raises `ValueError` for a row that comes more than a minute after the one before it.
     """
     frames = _frames_of(detector)
     if frames is None or not len(frames):
@@ -106,7 +95,7 @@ def first_step(detector: Detector, first: int | None, frames_per_second: float) 
     first, most = first or int(frames[0]), int(60 * frames_per_second)
     before = np.append(first, frames[:-1])
     late = np.flatnonzero(frames - before > most)
-    if len(late) and not (isinstance(detector, Rows) and detector.is_limited):
+    if len(late):
         at = late[0]
         raise ValueError(
             f"detections: frame {frames[at]} comes {frames[at] - before[at]} frames after frame"
@@ -131,8 +120,7 @@ def observe(
     elif frames is None:
         steps = zip(itertools.count(first), itertools.repeat(None))
     else:
-        last = detector.last if isinstance(detector, Rows) else frames.max(initial=0)
-        steps = zip(range(first, last + 1), itertools.repeat(None))
+        steps = zip(range(first, frames.max(initial=0) + 1), itertools.repeat(None))
 
     def detect(number: int, still: np.ndarray | None) -> Any:
         if isinstance(detector, Rows | Mapping):
