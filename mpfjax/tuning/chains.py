@@ -15,8 +15,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count, CountOrZero, warn
 from mpfjax.operations.compiling import jit_on_wide_vectors
+from mpfjax.operations.stored import select_rows
 from mpfjax.running.long_runs import Checkpoint, LongRun, State
-from mpfjax.tuning.densities import RandomWalk, SamplePrior, chosen, drawn, random_walk
+from mpfjax.tuning.densities import RandomWalk, SamplePrior, drawn, random_walk
 from mpfjax.tuning.problem import Problem, Reals
 from mpfjax.tuning.summaries import effective_sample_size, numbers_of, row_of, split_r_hat, table
 
@@ -152,8 +153,7 @@ class Sampling:
             keys = jax.random.split(again, self.num_chains)
             walk = random_walk(self.deviations, reals)
             new, now_fine, none = _start_all(kernel, keys, reals, walk)
-            both = jnp.asarray(fine), states, new.states
-            states = jax.vmap(chosen)(*both) if attempt else new.states
+            states = select_rows(jnp.asarray(~fine), new.states, states) if attempt else new.states
             fine = fine | np.asarray(now_fine)
             if fine.all():
                 walk = random_walk(self.deviations, states.reals)

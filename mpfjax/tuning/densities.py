@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from mpfjax.arrays import POSITIVE
 from mpfjax.checks import checked, saying, shown
 from mpfjax.operations.matrices import cholesky
+from mpfjax.operations.stored import select_rows
 from mpfjax.tuning.bijections import AbstractTransform
 from mpfjax.tuning.evidence import UnbiasedFilter, pose_evidence
 from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms
@@ -208,11 +209,6 @@ def number_or_zero(log_density: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(is_invalid(log_density), -jnp.inf, log_density)
 
 
-def chosen(accepted: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
-    """One of two states."""
-    return jax.tree.map(lambda after, before: jnp.where(accepted, after, before), new, old)
-
-
 class RandomWalk(eqx.Module):
     """u + F z, z standard normal, with F Fᵀ from the covariance of a posterior.
 
@@ -278,7 +274,7 @@ def metropolis_step(
     proposed, invalid = evaluate(key_fresh, reals)
     gain = proposed.log_density - point.log_density  # where it is NaN, the step is rejected
     accepted = jnp.log(jax.random.uniform(key_accept, (), gain.dtype)) < gain
-    return chosen(accepted, proposed, point), accepted, invalid
+    return select_rows(accepted, proposed, point), accepted, invalid
 
 
 def checked_deviations(values: float | Mapping[str, Any], start: Reals) -> Reals:

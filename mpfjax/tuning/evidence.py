@@ -14,6 +14,7 @@ from mpfjax.models.base import require, with_inputs
 from mpfjax.models.law import law_of, refuse_marginalised
 from mpfjax.models.series import Series, as_series, series_of
 from mpfjax.moves.base import AbstractProposal, all_of, check_keep_parents
+from mpfjax.operations.logarithms import without_gradient
 from mpfjax.running.results import FilterRun
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions
@@ -100,8 +101,7 @@ class FisherEvidence(LogEvidence):
 
     def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, " series"]:
         """log Ẑ of one run for each sequence."""
-        floats, rest = eqx.partition(filter, eqx.is_inexact_array)
-        fixed = eqx.combine(jax.lax.stop_gradient(floats), rest)
+        fixed = without_gradient(filter)
 
         def log_joint(key: Key[Array, ""], run: FilterRun, series: Series) -> Float[Array, ""]:
             about = fixed.model, mixtures_of(run), series.inputs

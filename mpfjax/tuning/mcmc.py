@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.checks import Count, CountOrZero, checked
 from mpfjax.filter import Filter
 from mpfjax.models.base import require
+from mpfjax.operations.stored import select_rows
 from mpfjax.running.long_runs import Checkpoint
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.conditional import check_conditional, possible_times, renew
@@ -247,7 +248,7 @@ class _Gibbs(AbstractKernel):
         possible = possible_times(filter.model, result.trajectory, series.inputs)
         broken = jnp.any(densities.is_invalid(result.run.log_likelihood_increments))
         broken |= ~jnp.all(result.possible & possible)
-        pair = densities.chosen(~broken, _Pair(reals, result.trajectory), state)
+        pair = select_rows(~broken, _Pair(reals, result.trajectory), state)
 
         def changed(new: Array, old: Array) -> Bool[Array, " times"]:
             return jnp.any((new != old).reshape(new.shape[0], -1), axis=1)
