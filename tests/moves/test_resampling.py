@@ -165,7 +165,7 @@ def group(states):
 
 
 ADAPTIVE, EQUAL, GROUPS = (
-    Resample(ess_threshold=0.5), Resample(allocation="equal"), Resample(allocation=group)
+    Resample(ess_threshold=0.5), Resample(allocation="equal"), Resample(group=group)
 )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import stored, take
 
 Scheme = Annotated[str, one_of(SCHEMES)]
-Allocation = Literal["variance", "equal", "root"] | Groups
+Allocation = Literal["variance", "equal", "root"]
 _POWER = 0.25  # of a component's weight, by which "root" allocates slots
 
 
@@ -44,16 +44,17 @@ class Resample(AbstractResampling):
     - `particles_per_component`: None divides all slots among the active components that are
       resampled, according to `allocation`. A number k assigns k particles to each active component
       and leaves the other slots empty, as in section 5.2 of the paper.
-    - `allocation`: how the components share the slots, unless `particles_per_component` determines
-      it. "variance" minimises the variance of Ẑ (Neyman 1934): the share of component m
+    - `allocation`: how the components share the slots, unless `particles_per_component` or `group`
+      determines it. "variance" minimises the variance of Ẑ (Neyman 1934): the share of component m
       is in proportion to the root of π_m² k_m / ESS_m. A quarter to a half of the slots is divided
       equally, so that every mode is retained (see docs/masses.md). "equal" is the paper's: it
       retains improbable modes longest, and log Ẑ is less accurate. "root" is between the two, in
-      proportion to the fourth root of π_m, for many components. A function returns the number of
-      each particle's group, the same within a component: groups with a component that is resampled
-      share the slots equally, and so do the components within a group. Use it if components are
-      rival hypotheses about several objects, so that an object with many hypotheses does not take
-      the slots of the others.
+      proportion to the fourth root of π_m, for many components.
+    - `group`: a function that returns the number of each particle's group, the same within a
+      component. Groups with a component that is resampled share the slots equally, and so do the
+      components within a group. None makes no groups. Use it if components are rival hypotheses
+      about several objects, so that an object with many hypotheses does not take the slots of the
+      others.
     - `along_curve`: whether the particles of a component are resampled in the order of a Hilbert
       curve of their state, of which all floating-point components are standardised within the
       component, and more than 8 reduced to their first principal components. Systematic and
@@ -72,7 +73,7 @@ class Resample(AbstractResampling):
       and need none, because regrouping does not change the distribution.
 
     Raises `ValueError` for an unknown scheme or gradient or allocation, a threshold outside [0, 1],
-    k < 1, and k together with groups.
+    k < 1, and k together with `group`.
     """
 
     scheme: Scheme = eqx.field(static=True, default="systematic")
@@ -81,10 +82,11 @@ class Resample(AbstractResampling):
     along_curve: bool = eqx.field(static=True, default=False, kw_only=True)
     gradient: Gradient = eqx.field(static=True, default="none", kw_only=True)
     allocation: Allocation = eqx.field(static=True, default="variance", kw_only=True)
+    group: Groups | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self) -> None:
-        if callable(self.allocation) and self.particles_per_component is not None:
-            raise ValueError("allocation: particles_per_component leaves no slots to groups")
+        if self.group is not None and self.particles_per_component is not None:
+            raise ValueError("group: groups have no effect together with particles_per_component")
 
     approximate = False
     biases_score = property(lambda self: self.gradient == "none" and self.ess_threshold > 0)
@@ -169,8 +171,8 @@ class Resample(AbstractResampling):
     ) -> Int[Array, " m"]:
         """How many slots each component receives; components that are not `due` keep theirs."""
         num_slots, demands = mixture.num_usable_slots, jnp.ones_like(line.totals)
-        if callable(self.allocation):
-            demands = demands_of_groups(mixture, self.allocation(mixture.particles), due)
+        if self.group is not None:
+            demands = demands_of_groups(mixture, self.group(mixture.particles), due)
         elif self.allocation == "root":
             demands, _ = scaled_exp(jnp.where(due, _POWER * line.log_masses, -jnp.inf))
         elif self.allocation == "variance" and mixture.num_components > 1:

@@ -115,7 +115,7 @@ def objects_filters(frame: Frame, boxes: Boxes) -> dict[str, Filter]:
     mixture = Filter(
         model,
         moves=[
-            Resample(allocation=_object),
+            Resample(group=_object),
             Propagate(),
             *([exclusion] if len(boxes) > 1 else []),
             learn,
