@@ -342,7 +342,7 @@ def _keys(kind: Any) -> Rule:
 
 def is_key(value: Any) -> bool:
     """Whether it is a typed key, or an array of them."""
-    return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
+    return hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
 
 
 def _instance(kind: type) -> Rule:

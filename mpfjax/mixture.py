@@ -303,9 +303,8 @@ class ParticleMixture(eqx.Module):
         """
         values = _numbers(values)
         is_filled, zero = along_rows(self.occupied, values), jnp.zeros((), values.dtype)
-        products = along_rows(self.weights.astype(values.dtype), values) * jnp.where(
-            is_filled, values, zero
-        )
+        filled = jnp.where(is_filled, values, zero)
+        products = along_rows(self.weights.astype(values.dtype), values) * filled
         # On a CPU, XLA may take thirty times as long for a sum that also multiplies.
         return jnp.sum(jnp.where(is_filled, products, zero), axis=0)
 

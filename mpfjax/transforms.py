@@ -163,9 +163,8 @@ def with_initialisation(filter: Filter, num_observations: Count = 8) -> Filter:
     are then near a mode, and chance decides its weight. `num_observations` is L: as many as
     distinguish the modes. It is also the number for restarts.
     """
-    initial = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
-    filter = filter.replace(initial_moves=initial)
-    return _with_restart(filter, num_observations=num_observations, at_start=True)
+    plain = with_initial_selection(filter, 1)
+    return _with_restart(plain, num_observations=num_observations, at_start=True)
 
 
 @checked

@@ -129,11 +129,8 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
 
         `axes` are those of the objects.
         """
-
-        def of_one(j: Int[Array, ""], *parts: PyTree) -> PyTree:
-            return getattr(self.object_at(j), method)(*parts)
-
-        return jax.vmap(of_one, in_axes=(0, *axes), out_axes=1)(self._indices, *arguments)
+        of_one = jax.vmap(partial(self._ask, method), in_axes=(0, *axes), out_axes=1)
+        return of_one(self._indices, *arguments)
 
     @property
     def _noise_dimension(self) -> int:

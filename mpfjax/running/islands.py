@@ -11,7 +11,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
@@ -166,11 +166,6 @@ class IslandInteraction(AbstractMove):
         """The move itself: on the one island of conditional SMC it does nothing."""
         return self
 
-    def is_due(self, mixture: ParticleMixture) -> Bool[Array, ""]:
-        """Whether the masses of the islands are uneven enough; the result is the same on each."""
-        log_masses = over_islands(mixture.log_mass)
-        return 1 / jnp.sum(softmax(log_masses) ** 2) < self.threshold * num_islands()
-
     def __call__(self, key: Key[Array, ""], mixture: ParticleMixture, now: Step) -> ParticleMixture:
         """Deal the particles if it is due, unless y_t is missing."""
         n, islands = mixture.num_particles, num_islands()
@@ -178,7 +173,9 @@ class IslandInteraction(AbstractMove):
             return mixture
         if n % islands:
             raise ValueError(f"num_particles: {n} of an island, for {islands} islands alike")
-        return jax.lax.cond(self.is_due(mixture), lambda: mixture.map_slots(_deal), lambda: mixture)
+        weights = softmax(over_islands(mixture.log_mass))  # the same on each island
+        is_uneven = 1 / jnp.sum(weights**2) < self.threshold * islands
+        return jax.lax.cond(is_uneven, lambda: mixture.map_slots(_deal), lambda: mixture)
 
 
 def _deal(values: Array) -> Array:

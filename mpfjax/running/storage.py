@@ -19,6 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from mpfjax.checks import is_key
+
 FilePath = str | os.PathLike[str]
 
 _MOST_SHOWN = 4
@@ -157,10 +159,6 @@ def kind(leaf: Any) -> str:
     if is_number(leaf):
         return f"a Python {type(leaf).__name__}"
     return f"{leaf.dtype}{list(leaf.shape)}"
-
-
-def is_key(leaf: Any) -> bool:
-    return not is_number(leaf) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def as_numpy(leaf: Any) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Whole trajectories of a run: the genealogy of its particles, and backward sampling."""
 
+import dataclasses
 from typing import Any, Literal
 
 import equinox as eqx
@@ -15,8 +16,8 @@ from mpfjax.memory import check_past
 from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, require, with_inputs
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
-from mpfjax.models.observations import refusal_of, refuse_where
-from mpfjax.models.series import present_steps, rows_of, series_of, steps_of_inputs, with_gaps
+from mpfjax.models.observations import refuse_where
+from mpfjax.models.series import as_series, series_of, steps_of_inputs, with_gaps
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import count_places, take
@@ -188,9 +189,8 @@ def sample_trajectories(
         stacked = _ending_in(component, stacked)
     if is_marginalised(model) or observations is not None:
         if observations is not None:
-            observations = rows_of(observations)
-            present = present_steps(observations, series, refusal_of(model))
-            observations = with_gaps(observations, present)
+            steps = as_series(dataclasses.replace(series, inputs=None), model)
+            observations = with_gaps(steps.observations, steps.present)
         check_marginalised(model, stacked, observations, method)
         data = observations, inputs
         paths, indices = sample_marginalised(key, model, stacked, *data, num_trajectories)
