@@ -31,8 +31,8 @@ class Bug(NamedTuple):
 
 BUGS = {
     "an object that was missed stays as probable": Bug(
-        "masses = detected_masses + unseen * before.of_owners(1 / rows, 1)",
-        "masses = detected_masses + unseen",
+        "+ unseen * before.of_owners(1 / rows, 1)",
+        "+ unseen",
         "tests/moves/test_bernoulli.py -k sensors_in_turn",
     ),
     "the proposal's density has the wrong sign": Bug(

@@ -29,8 +29,8 @@ _SAME = 2.0  # variances by which two components may differ that may describe on
 class _Intensity(NamedTuple):
     """How many objects to expect at each particle, as a step goes on.
 
-    The first `num_undetected` particles are of objects that no measurement has revealed, old ones
-    and then new ones. The others are of objects that may exist, each in an `owners` of its own.
+    The first u particles are of objects that no measurement has revealed, v old ones and then new
+    ones. The others are of m objects that may exist, each in an `owners` of its own.
     `starts` are the sensors, from 1 on, whose last scan revealed an object first, 0 for older ones.
     `references` are the masses of the undetected particles as draws of a newborn object, 0 of those
     that had a component, and `densities` how many times as many old objects are at each.
@@ -42,20 +42,43 @@ class _Intensity(NamedTuple):
     starts: Int[Array, " m"]
     references: Float[Array, " u"]
     densities: Float[Array, " v"]
-    num_undetected: int
-    num_objects: int
     log_evidence: Float[Array, ""]
 
     def sums(self, values: Float[Array, "p *k"]) -> Float[Array, "m *k"]:
         """Over each object's particles."""
-        return jax.ops.segment_sum(values[self.num_undetected :], self.owners, self.num_objects)
+        values = values[len(self.references) :]
+        return jax.ops.segment_sum(values, self.owners, len(self.starts))
 
     def of_owners(
         self, objects: Shaped[Array, "m *k"], undetected: float = 0
     ) -> Shaped[Array, "p *k"]:
         """What belongs to each particle's object, or to those that are not detected."""
-        first = jnp.full((self.num_undetected, *objects.shape[1:]), undetected, objects.dtype)
+        first = jnp.full((len(self.references), *objects.shape[1:]), undetected, objects.dtype)
         return jnp.concatenate([first, take(objects, self.owners)])
+
+    def with_objects(
+        self, born: PyTree, parents: Int[Array, "k b"], masses: Float[Array, "k b"], sensor: int
+    ) -> "_Intensity":
+        """With one more object for each measurement of a sensor.
+
+        `parents` below v are old undetected particles, others the `born` of the measurement.
+        """
+        num_old, (num_new, size) = len(self.densities), parents.shape
+        places = jnp.arange(num_new, dtype=jnp.int32)[:, None]
+        offsets = len(self.masses) + places * size - num_old
+        parents = jnp.where(parents < num_old, parents, parents + offsets).reshape(-1)
+
+        def join(old: Array, born: Array) -> Array:
+            every = jnp.concatenate([old, born.reshape(-1, *old.shape[1:])])
+            return jnp.concatenate([old, take(every, parents)])
+
+        new_owners = jnp.repeat(len(self.starts) + places[:, 0], size)
+        return self._replace(
+            states=jax.tree.map(join, self.states, born),
+            masses=jnp.concatenate([self.masses, masses.reshape(-1)]),
+            owners=jnp.concatenate([self.owners, new_owners]),
+            starts=jnp.pad(self.starts, (0, num_new), constant_values=sensor + 1),
+        )
 
 
 class Associate(AbstractWrapper):
@@ -173,8 +196,6 @@ class Associate(AbstractWrapper):
             memory["starts"][1:],
             jnp.append(references, jnp.full_like(references, 1 / size)),
             jnp.where(references > 0, old / jnp.where(references > 0, references, 1.0), 0.0),
-            2 * size,
-            mixture.num_components - 1,
             jnp.zeros_like(mixture.log_scale),
         )
 
@@ -188,50 +209,33 @@ class Associate(AbstractWrapper):
     ) -> _Intensity:
         """The intensity given the measurements of one sensor."""
         key_born, key_drawn = split(key, 2)
-        sensor, first = model.sensors[number], before.num_undetected
+        sensor, num_old = model.sensors[number], len(before.densities)
         log_odds, detection = sensor.log_odds(scan, before.states), sensor.detection(before.states)
         born, log_born = self._born(key_born, model, scan, number)
-        num_survivors = first // 2  # the others are new ones, proposed at the measurements
-        density, is_dense = _density_at(log_odds[:num_survivors], detection[:num_survivors], before)
+        density, is_dense = _density_at(log_odds[:num_old], detection[:num_old], before)
         log_born += jnp.log1p(jnp.where(is_dense, 0.0, density) / model.birth.rate)[:, None]
         highest = jnp.maximum(jnp.max(log_odds, axis=0), jnp.max(log_born, axis=1))
         units = jax.lax.stop_gradient(jnp.maximum(highest, 0.0))
+
+        # G_j u of each pair, and of each measurement's first objects, in units of the measurement.
         likely = (before.masses * detection)[:, None] * exp(log_odds - units[None])
-        begins = is_dense[:, None] | (before.references[None, :num_survivors] == 0)
-        begins = jnp.where(begins, likely[:num_survivors].T, 0.0)
+        begins = is_dense[:, None] | (before.references[None, :num_old] == 0)
+        begins = jnp.where(begins, likely[:num_old].T, 0.0)
         starts = jnp.concatenate([begins, exp(log_born - units[:, None])], axis=1)
 
-        pairs, unseen = before.sums(likely), before.masses * (1 - detection)
+        unseen = before.masses * (1 - detection)
         missed = before.sums(unseen) + jnp.maximum(1 - before.sums(before.masses), 0.0)
-        totals = jnp.sum(starts, axis=1)
-        association = associate(pairs, missed, jnp.exp(-units) + totals)
+        alone = jnp.exp(-units) + jnp.sum(starts, axis=1)
+        association = associate(before.sums(likely), missed, alone)
         rows = association.row_sums
         replies = before.of_owners(association.replies / rows[:, None])
-        detected_masses = jnp.sum(likely * replies, axis=1)
-        masses = detected_masses + unseen * before.of_owners(1 / rows, 1)
+        masses = jnp.sum(likely * replies, axis=1) + unseen * before.of_owners(1 / rows, 1)
         log_evidence = association.log_total + jnp.sum(units)
-        log_evidence -= jnp.sum((before.masses * detection)[:first])
+        log_evidence -= jnp.sum((before.masses * detection)[: len(before.references)])
 
-        num_rows, size = len(totals), self.particles_per_birth
-        parents, shares = _redrawn(key_drawn, starts, size)
-        new_masses = shares / association.column_sums[:, None]
-        places = jnp.arange(num_rows, dtype=jnp.int32)[:, None]
-        offsets = len(masses) + places * size - num_survivors
-        parents = jnp.where(parents < num_survivors, parents, parents + offsets).reshape(-1)
-
-        def join(old: Array, born: Array) -> Array:
-            every = jnp.concatenate([old, born.reshape(-1, *old.shape[1:])])
-            return jnp.concatenate([old, take(every, parents)])
-
-        new_owners = jnp.repeat(before.num_objects + places[:, 0], size)
-        return before._replace(
-            states=jax.tree.map(join, before.states, born),
-            masses=jnp.concatenate([masses, new_masses.reshape(-1)]),
-            owners=jnp.concatenate([before.owners, new_owners]),
-            starts=jnp.pad(before.starts, (0, num_rows), constant_values=number + 1),
-            num_objects=before.num_objects + num_rows,
-            log_evidence=before.log_evidence + log_evidence,
-        )
+        parents, shares = _redrawn(key_drawn, starts, self.particles_per_birth)
+        after = before._replace(masses=masses, log_evidence=before.log_evidence + log_evidence)
+        return after.with_objects(born, parents, shares / association.column_sums[:, None], number)
 
     def _born(
         self, key: Key[Array, ""], model: TargetsModel, scan: PyTree, number: int
@@ -388,7 +392,7 @@ def _references(intensity: _Intensity) -> Float[Array, " p"]:
 
     Each half counts by its objects, so that where all places are alike, so are their densities.
     """
-    num_old, first = intensity.num_undetected // 2, intensity.num_undetected
+    num_old, first = len(intensity.densities), len(intensity.references)
     is_old = jnp.arange(first) < num_old
     masses = jnp.where(intensity.references > 0, intensity.masses[:first], 0.0)
     shares = _normalised(jax.ops.segment_sum(masses, is_old.astype(jnp.int32), 2))
