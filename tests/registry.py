@@ -22,7 +22,6 @@ from mpfjax import (
     KMeans,
     Merge,
     MultiObjectModel,
-    Partitioned,
     Pool,
     Propagate,
     RandomPartition,
@@ -132,15 +131,6 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         "split only, adaptive": _chain(Resample(ess_threshold=0.5), m=m, then=[Split(2.0)]),
         "random labels, stratified": _chain(RandomLabels(), Resample("stratified"), m=m),
         "gaussian mixture": _chain(GaussianRegeneration(), m=m, then=[KMeans()]),
-        "partitioned in clusters": _joint(
-            lambda joint: Filter(
-                joint,
-                [Resample(), KMeans(), Partitioned([(c % 2, 1 - c % 2) for c in range(m)])],
-                NUM_PARTICLES,
-                m,
-                initial_moves=[KMeans(3, reseed=True)],
-            )
-        ),
     }
 
 

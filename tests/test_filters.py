@@ -61,11 +61,10 @@ def test_resampling_is_reported_where_it_happens():
 
 @pytest.mark.exactness
 def test_broken_and_impossible_densities_within_a_run():
+    """One step without any likelihood leaves no NaN; what else it is, the matrix asks."""
     filter, keys = CHAINS["kmeans only"](QUADRATIC), jax.random.split(KEY, 2)
     run = mpfjax.run_filter(KEY, filter, OBSERVATIONS.at[1].set(BLINDED))
-    assert run.log_marginal_likelihood == -jnp.inf
     np.testing.assert_array_equal(run.degenerate, [False, True, False, False])
-    np.testing.assert_array_equal(np.isfinite(run.log_likelihood_increments), ~run.degenerate)
     assert not any(np.isnan(leaf).any() for leaf in jax.tree.leaves(run))
     broken = OBSERVATIONS.at[2].set(BROKEN)
     for runner, key in ((mpfjax.run_filter, KEY), (mpfjax.monte_carlo, keys)):

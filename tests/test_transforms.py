@@ -13,12 +13,6 @@ MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
 OBSERVATIONS = np.array([1.5, 1.0, 0.4], np.float32)
 
 
-def own_chain():
-    """A chain that no recipe makes, with a resampling from time to time."""
-    moves = [mpfjax.Every(2, [mpfjax.Resample("stratified"), mpfjax.KMeans(2)]), mpfjax.Propagate()]
-    return mpfjax.Filter(MODEL, moves, 32, 2, initial_moves=[mpfjax.KMeans(3, reseed=True)])
-
-
 def final(filter):
     return mpfjax.run_filter(KEY, filter, OBSERVATIONS).final
 
@@ -70,7 +64,7 @@ def test_a_look_ahead_and_proposals_are_put_on_and_taken_off():
 @pytest.mark.exactness
 def test_a_filter_is_replaced_by_its_own_arguments():
     other = mpfjax.QuadraticModel(0.1, 0.5, -2.0, 2.0)
-    filter = mpfjax.with_initial_selection(own_chain(), 3)
+    filter = mpfjax.with_initial_selection(mpfjax.mixture_particle_filter(MODEL, 32, 2), 3)
     changed = filter.replace(model=other, num_particles=50)
     assert changed.num_particles == 50
     assert changed.model is other

@@ -38,9 +38,7 @@ def assert_double(tree):
 
 
 @pytest.mark.exactness
-@pytest.mark.parametrize(
-    "chain", quick_of([*QUICK_CHAINS, "guided mpf", "partitioned in clusters"], ["guided mpf"])
-)
+@pytest.mark.parametrize("chain", quick_of([*QUICK_CHAINS, "guided mpf", "dps"], ["guided mpf"]))
 def test_chains_of_each_kind_are_traced(chain):
     filter, seen = CHAINS[chain](quadratic()), jnp.asarray(SQUARES)
     series = Series(seen, present=jnp.isfinite(seen))
