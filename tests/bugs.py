@@ -77,9 +77,9 @@ BUGS = {
         "tests/running/test_storage.py -k LongRuns",
     ),
     # Filters, resampling and regrouping.
-    "a point of stratified resampling is drawn in the slot after its own": Bug(
-        "slot = jnp.clip(dealt.before.whole, 0, shift.shape[0] - 1)",
-        "slot = jnp.clip(dealt.before.whole + 1, 0, shift.shape[0] - 1)",
+    "points of stratified resampling lie in half of their slots": Bug(
+        "comes_before = take(shift, slot) < dealt.before.fraction",
+        "comes_before = take(shift, slot) < 0.5 * dealt.before.fraction",
         "tests/moves/test_contracts.py -k unbiased",
     ),
     "a look-ahead is not divided out again": Bug(
