@@ -14,7 +14,7 @@ from mpfjax.lookahead.twisted import Twist
 from mpfjax.models.base import with_inputs
 from mpfjax.models.law import Law, law_of
 from mpfjax.models.series import Series
-from mpfjax.running.results import FilterRun
+from mpfjax.running.results import FilterRun, after_first, append_last
 
 # The effective number of particles for each coefficient of a regression.
 _PARTICLES_A_COEFFICIENT = 4
@@ -32,10 +32,7 @@ def fit_lookahead(
 ) -> Twist:
     """ψ_T, ..., ψ_1 and that of x_0, from a run of `filter`, twisted by `twist`."""
     key_steps, key_initial = jax.random.split(key)
-    earlier = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None].astype(rest.dtype), rest[:-1]]),
-        run.initial, run.collected,
-    )  # fmt: skip
+    earlier = jax.tree.map(lambda leaf: leaf[:-1], after_first(run.initial, run.collected))
     used = jax.tree.map(lambda leaf: leaf[:-1], twist.steps)
     last = jax.tree.map(lambda leaf: leaf[-1], twist.steps)
 
@@ -59,7 +56,7 @@ def fit_lookahead(
 
     keys = jax.random.split(key_steps, series.length)
     first, fitted = jax.lax.scan(back, last, (keys, used, earlier, series), reverse=True)
-    whole = jax.tree.map(lambda some, end: jnp.concatenate([some, end[None]]), fitted, last)
+    whole = append_last(fitted, last)
     initial = twist.initial
     if initial is not None:
         initial = _if_finite(_fit_initial(key_initial, filter, twist, initial, first), initial)

@@ -123,6 +123,18 @@ class FilterRun(eqx.Module):
         return None if self.log_likelihood_increments.ndim > 1 else component_table(self.final)
 
 
+def append_last(rows: PyTree, row: PyTree) -> PyTree:
+    """The rows of the earlier times, followed by the row of the last time."""
+    return jax.tree.map(lambda before, end: jnp.concatenate([before, end[None]]), rows, row)
+
+
+def after_first(row: PyTree, rows: PyTree) -> PyTree:
+    """The row of the first time, followed by the rows of the later times."""
+    return jax.tree.map(
+        lambda first, later: jnp.concatenate([first[None].astype(later.dtype), later]), row, rows
+    )
+
+
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in plain text, columns aligned to the right but for the first."""
     widths = [max(len(line[i]) for line in [header, *rows]) for i in range(len(header))]

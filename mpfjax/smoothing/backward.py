@@ -54,18 +54,6 @@ def draw_ends(
     return indices, jax.tree.map(lambda leaf: take(leaf, indices), final.particles)
 
 
-def append_last(rows: PyTree, row: PyTree) -> PyTree:
-    """The rows of the earlier times, followed by the row of the last time."""
-    return jax.tree.map(lambda before, end: jnp.concatenate([before, end[None]]), rows, row)
-
-
-def after_first(row: PyTree, rows: PyTree) -> PyTree:
-    """The row of the first time, followed by the rows of the later times."""
-    return jax.tree.map(
-        lambda first, later: jnp.concatenate([first[None].astype(later.dtype), later]), row, rows
-    )
-
-
 def log_kernel_from(model: Any, mixture: ParticleMixture) -> Callable[[PyTree], Array]:
     """log D(state | x^i) of every particle, (n,), as a function of a state."""
     n = mixture.num_particles

@@ -11,8 +11,7 @@ from mpfjax.models.base import with_inputs
 from mpfjax.models.law import law_of
 from mpfjax.models.series import steps_of_inputs
 from mpfjax.operations.compiling import jit_with_floats_traced
-from mpfjax.running.results import FilterRun
-from mpfjax.smoothing.backward import after_first
+from mpfjax.running.results import FilterRun, after_first
 
 
 class Forecast(eqx.Module):

@@ -37,7 +37,8 @@ from mpfjax.models.gaussians import (
 from mpfjax.models.law import law_of
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
-from mpfjax.smoothing.backward import after_first, append_last, draw_ends, draw_exactly, rows_at
+from mpfjax.running.results import after_first, append_last
+from mpfjax.smoothing.backward import draw_ends, draw_exactly, rows_at
 
 
 class Information(NamedTuple):

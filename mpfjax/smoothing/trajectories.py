@@ -21,7 +21,7 @@ from mpfjax.models.series import as_series, series_of, steps_of_inputs, with_gap
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import count_places, take
-from mpfjax.running.results import FilterRun
+from mpfjax.running.results import FilterRun, after_first, append_last
 from mpfjax.smoothing import backward
 from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
@@ -48,7 +48,7 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     mixtures = refuse_where(jnp.any(began_anew), mixtures, f"mixtures: {NO_PAST}")
     if not is_run:
         return mixtures
-    return backward.after_first(run.initial.replace(memory={}), mixtures)
+    return after_first(run.initial.replace(memory={}), mixtures)
 
 
 def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:
@@ -250,7 +250,7 @@ def draw_trajectories(key, model, mixtures, inputs, num_trajectories, method):
     keys = jax.random.split(key_steps, num_earlier)
     steps = (keys, earlier, ancestors, proposed, inputs)
     _, past = jax.lax.scan(back, (states, last), steps, reverse=True)
-    states, indices = backward.append_last(past, (states, last))
+    states, indices = append_last(past, (states, last))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states), indices
 
 
