@@ -308,13 +308,16 @@ def test_sensors_in_turn_scans_without_measurements_and_missing_ones():
 
 @pytest.mark.exactness
 def test_two_components_of_one_object_become_one():
-    """Where both may be true by their probabilities they stay, and where they are apart."""
+    """Where both may be true they stay, where they are apart, and where one is broad."""
     filter = Filter(model(1e-12), [associating(undetected_particles=10)], 210, 3)
     near = np.linspace(-1, 1, 100) + np.array([0.0, 0.8])[:, None]
-    for gap, existence, expected in (
-        (0.0, [0.5, 0.4], [0.9, 0]), (0.0, [0.7, 0.6], [0.7, 0.6]), (9.0, [0.5, 0.4], [0.5, 0.4])
-    ):  # fmt: skip
-        states = near + gap * np.arange(2)[:, None]
+    for gap, width, existence, expected in (
+        (0.0, 1.0, [0.5, 0.4], [0.9, 0]),
+        (0.0, 1.0, [0.7, 0.6], [0.7, 0.6]),
+        (9.0, 1.0, [0.5, 0.4], [0.5, 0.4]),
+        (0.0, 3.0, [0.5, 0.4], [0.5, 0.4]),
+    ):
+        states = near * np.array([[1.0], [width]]) + gap * np.arange(2)[:, None]
         moved = filter.predict(KEY, bernoulli_mixture(filter, states[..., None], existence))[0]
         found = mpfjax.estimate_targets(moved)
         np.testing.assert_allclose(found.existence, 0.95 * np.array(expected), atol=1e-3)
