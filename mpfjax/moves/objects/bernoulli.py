@@ -110,11 +110,12 @@ class Associate(AbstractWrapper):
     5. Each component is resampled, by `resample`, and component 0 systematically.
 
     The total weight grows by log p of the scan over log p of clutter alone, as in `ClutteredModel`.
-    It is exact for one scan of one sensor in which no two objects compete for two measurements.
-    Four steps are approximate: belief propagation, whose log p is otherwise Bethe's; the merging of
-    components; step 4; and the product form after the scan of each sensor, by which objects are
-    independent although the scan made them exclude each other, so that log Ẑ of several scans or
-    sensors has an error. Labels count objects from 1. They are not identities once two objects have
+    It is exact for one scan of one sensor in which no two objects compete for two measurements, if
+    undetected objects are distributed like newborn ones. Five steps are approximate: belief
+    propagation, whose log p is otherwise Bethe's; the merging of components; the ratio of step 2;
+    step 4; and the product form after the scan of each sensor, by which objects are independent
+    although the scan made them exclude each other, so that log Ẑ of several scans or sensors has an
+    error. Labels count objects from 1. They are not identities once two objects have
     been close, for any filter. `memory["targets"]` contains the number, the labels, and how many
     objects were crowded out.
 
