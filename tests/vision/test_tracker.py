@@ -311,6 +311,20 @@ def test_an_object_that_moves_its_length_in_a_frame_is_tracked_from_its_second(s
     assert (tracks.identities.max() == 2) == is_tracked
 
 
+@pytest.mark.parametrize(("away", "is_known"), [(60, True), (6, False)])
+def test_what_was_weakly_detected_for_a_while_is_shown_with_its_first_strong_detection(
+    away, is_known
+):
+    """Three tenths of a second; but not beside an object, where it may be one more box of it."""
+    tracker = ObjectTracker(M, frames_per_second=10)
+    state = tracker.init()
+    for t in range(6):
+        boxes = np.array([[100.0, 50, 20, 40], [100.0 + away, 72, 20, 40]])
+        scores = np.array([1.0, 0.8 if t == 5 else 0.3])
+        state, tracks = tracker.step(None, state, None, (boxes, scores))
+        assert tracks.shown.sum() == 1 + (t == 5 and is_known)
+
+
 # --- a camera that shakes ------------------------------------------------------------------
 
 

@@ -13,7 +13,7 @@ _CONFIRMED = 2  # frames with strong detections after which there is an object
 _TENTATIVE = 1  # frames that it may be missed in before
 _BINS = 20  # of the frames that an object may be without a detection
 _SCALE = 0.5  # of the logistic prior of coasting, in longest coasts
-_BESIDE = 0.15  # an overlap with an older object from which on one appears beside it
+BESIDE = 0.15  # an overlap with an older object from which on one appears beside it
 _LEAST = 1 / 3  # the probability of another object below which one beside it is a duplicate
 
 
@@ -90,7 +90,8 @@ class Lives(NamedTuple):
 
         An object ends if it has had no detection for longer than the patience, or for more than one
         frame while it is not confirmed. It is confirmed after two frames with strong detections
-        where its odds are for it, or at once in the first frame. Where there is no room, an
+        where its odds are for it, or at once: in the first frame, and alone after weak detections
+        in as many frames as one is shown without a strong one. Where there is no room, an
         unconfirmed one ends in its first frame without a detection, and one that was confirmed at
         once and has had no strong detections since ends as soon as it is no longer shown: after
         `coast` frames without a detection, or three tenths of a second without a strong one.
@@ -177,7 +178,7 @@ class Duplicates(NamedTuple):
         ended = np.sum(~stays & elder_lives & (self.elders > 0))
         elders = np.where(elder_lives, self.elders, 0)[stays]
         k = len(elders)
-        beside = overlaps.at(overlaps.values >= _BESIDE)
+        beside = overlaps.at(overlaps.values >= BESIDE)
         first, second = identities[beside.rows], identities[beside.columns]
         with_elder = np.append(elders, 0 * identities[k:])[beside.rows] == second
         is_apart = detected[:k].copy()
@@ -185,7 +186,7 @@ class Duplicates(NamedTuple):
         # Identities are in order.
         elder_rows = np.minimum(np.searchsorted(identities, elders), max(len(identities) - 1, 0))
         is_object = (elders > 0) & is_apart & detected[elder_rows]
-        younger = beside.at((beside.rows >= k) & (second < first) & (beside.values > _BESIDE))
+        younger = beside.at((beside.rows >= k) & (second < first) & (beside.values > BESIDE))
         order, new_elders = np.argsort(younger.values), 0 * identities[k:]
         # Of several the last is written, with which it overlaps most.
         new_elders[younger.rows[order] - k] = identities[younger.columns[order]]

@@ -40,6 +40,7 @@ class ScoreState(NamedTuple):
       be an object; `pending`: (c, bins), its detections by share while that is not decided.
     - `good`, `bad`: (bins,), detections of chains that proved to be objects, and of chains that
       ended before.
+    - `ages`: (d,), of the chains of this frame's detections; 1 for one more box of an object.
     """
 
     lasting: float
@@ -54,6 +55,7 @@ class ScoreState(NamedTuple):
     pending: Float[np.ndarray, "c bins"]
     good: Float[np.ndarray, " bins"]
     bad: Float[np.ndarray, " bins"]
+    ages: Float[np.ndarray, " d"] = np.zeros(0)
 
     @classmethod
     def initial(cls, coordinates: int, lasting: float) -> "ScoreState":
@@ -99,10 +101,12 @@ class ScoreState(NamedTuple):
         is_same = (overlaps.rows < overlaps.columns) & (overlaps.values > _DUPLICATE)
         single[overlaps.columns[is_same]] = False
         state = self._continue(boxes[single], shares[single], moved, frames, variance)
+        ages = np.ones(len(boxes))
+        ages[single] = state.ages
         strong = lowest + state.strong_share() * spread
         # Where all scores are equal, rounding must not put them below the threshold.
         weak = min(lowest + WEAK * spread, strong) if len(recent) else -np.inf
-        return state._replace(recent=recent, weak=weak, strong=strong)
+        return state._replace(recent=recent, weak=weak, strong=strong, ages=ages)
 
     def _continue(
         self, detections: Boxes, shares: Scores, moved: Chains, frames: float, variance: float
@@ -133,6 +137,8 @@ class ScoreState(NamedTuple):
         bins = np.clip((share_of_each * _BINS).astype(int), 0, _BINS - 1)
         pending[is_detected, bins[is_detected]] += 1
         age = np.append(self.age + frames, none + 1)
+        ages = np.ones(len(detections))
+        ages[rows[is_detected]] = age[is_detected]
         is_sure = is_detected & ((share_of_each >= _SURE) | (age >= self.lasting))
         sure = np.append(self.sure, none > 0) | is_sure
         unseen = np.where(is_detected, 0, np.append(self.unseen, none) + 1)
@@ -141,7 +147,7 @@ class ScoreState(NamedTuple):
         chains = boxes, steps, unseen, age, sure, np.where(sure[:, None], 0.0, pending)
         boxes, steps, unseen, age, sure, pending = (rows[~ended] for rows in chains)
         return self._replace(
-            boxes=boxes, steps=steps, unseen=unseen, age=age, sure=sure, pending=pending,
+            boxes=boxes, steps=steps, unseen=unseen, age=age, sure=sure, pending=pending, ages=ages,
             good=KEPT * self.good + good, bad=KEPT * self.bad + bad,
         )  # fmt: skip
 

@@ -10,7 +10,7 @@ from mpfjax.vision.tracking import associate, gaussian
 from mpfjax.vision.tracking.camera import find_jolt
 from mpfjax.vision.tracking.detections import FrameDetections, Kind
 from mpfjax.vision.tracking.gaussian import CameraMotion, Gaussian
-from mpfjax.vision.tracking.lives import Lives, Spans
+from mpfjax.vision.tracking.lives import BESIDE, Lives, Spans
 from mpfjax.vision.tracking.pairs import Flags, Integers, Numbers, Pairs
 from mpfjax.vision.tracking.scores import STRONG, WEAK
 from mpfjax.vision.tracking.state import TrackerState, Tracks
@@ -24,6 +24,7 @@ _FAST = np.ones(2)  # boxes a frame along x and y, the deviation of few new obje
 _FAST_COST = 3.0  # of a pair that is explained by it
 _YIELDING = 0.01  # of the claim of an object that takes only what others leave
 _BIRTH_OVERLAP = 0.5  # with an object or a stronger detection: it is one more box of the same
+_LEAST_AGE = 2  # frames of a chain of detections after which its object is confirmed at once
 _SAME = 0.5  # least overlap of a prediction that was right with the detection
 _CONTACT = 0.12  # an overlap from which on objects would learn each other's colours
 _FIRST = 3  # strong detections of an object after which it teaches the noises
@@ -337,6 +338,16 @@ def _births(
     return is_birth
 
 
+def _end_long_chains(
+    state: TrackerState, frame: _Frame, stays: Flags, born: Born
+) -> Bool[np.ndarray, " b"]:
+    """Which births end a chain of weaker detections that has lasted, and are beside no object."""
+    objects, boxes = gaussian.boxes_of(state.objects.place[stays]), frame.detections.boxes[born]
+    is_long = state.scores.ages[born] >= max(frame.spans.unsure, _LEAST_AGE)
+    is_long[gaussian.overlapping(objects, boxes, BESIDE).columns] = False
+    return is_long
+
+
 def _renew(
     kind: Kind, state: TrackerState, frame: _Frame, matches: _Matches, stays: Flags, born: Born
 ) -> TrackerState:
@@ -354,6 +365,7 @@ def _renew(
     # The scores of a first frame have hardly a rank: a single one is always the highest.
     is_first = kind.has_boxes and not state.has_begun
     at_once = is_first & (frame.detections.scores[born] >= STRONG)
+    at_once |= kind.has_boxes & _end_long_chains(state, frame, stays, born)
     new_lives = Lives.initial(names, frame.detections.classes[born], at_once, kind.odds)
     colours, vectors = (
         np.append(rows[stays], np.zeros((len(born), rows.shape[1])), axis=0)
