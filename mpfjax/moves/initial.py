@@ -13,7 +13,7 @@ from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import Line, sorted_order
 from mpfjax.operations.logarithms import default_float, exp, finite_or_zero
 from mpfjax.operations.random import split
-from mpfjax.operations.stored import stored, take, whole
+from mpfjax.operations.stored import apart, stored, take, whole
 
 # A particle that the first observation tells nothing of keeps a quarter of its chance, so that no
 # weight is more than four times the mean.
@@ -124,12 +124,9 @@ def selection_weights(
     predictor (Kelley 1927). Where a draw is mostly noise, ρ is near zero and all x are alike.
     Particles without weight do not count, nor do likelihoods that are no number.
     """
-    first, second = (
-        jnp.where((weights > 0) & (draw < jnp.inf), draw, -jnp.inf) for draw in log_factors
-    )
-    highest = finite_or_zero(jnp.max(jnp.maximum(first, second)))
-    # Stored, so that the exponentials are taken on vectors, and once.
-    first, second = (stored(exp(draw - highest)) for draw in (first, second))
+    log_factors = jnp.where((weights > 0)[None] & (log_factors < jnp.inf), log_factors, -jnp.inf)
+    # Apart, so that the exponentials are taken on vectors, and once.
+    first, second = apart(exp, log_factors - finite_or_zero(jnp.max(log_factors)))
     # All sums in one product: each one alone would be a kernel. Where the likelihoods are so much
     # alike that it loses their differences to rounding, trust in these does not matter.
     rows = jnp.stack([first, second, jnp.ones_like(weights)])

@@ -20,12 +20,13 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key, UInt32
 
 from mpfjax.operations.logarithms import default_float
-from mpfjax.operations.stored import on_platform, stored
+from mpfjax.operations.stored import apart, on_platform, stored
 
 Words = UInt32[Array, " *shape"]
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
 _SHORT_ROW = 8
+_FEW_KEYS = 4
 _FEW = 256
 # Giles (2010), "Approximating the erfinv function", table 5, highest power first: erf⁻¹(x) / x as
 # a polynomial in w - 2.5 where w = -log(1 - x²) is below 5, and in √w - 3 beyond.
@@ -73,20 +74,32 @@ def split(key: Key[Array, "*keys"], num: int) -> Key[Array, " num"]:
     """`jax.random.split`, the same keys; keys that are split stay.
 
     A longer split starts with the same keys. On a CPU the rounds of Threefry are written out, since
-    XLA's loop over them is ten kernels, and each takes time to compile. The keys are stored, since
-    XLA would hash again in all that uses them.
+    XLA's loop over them is ten kernels, and each takes time to compile. Apart, they are compiled
+    once for all splits into up to four.
     """
     if key.ndim or not _is_numbered(key):
         return key if key.ndim else jax.random.split(key, num)
-    return _split_unrolled(key, num)
+    return jax.random.wrap_key_data(_hashes(jax.random.key_data(key), num), impl="threefry2x32")
+
+
+def split_each(keys: Key[Array, " k"], num: int) -> Key[Array, "k num"]:
+    """Each key split."""
+    function = partial(split, num=num)
+    # Keys of some generators are split differently under `vmap`.
+    return jax.vmap(function)(keys) if _is_numbered(keys) else jax.lax.map(function, keys)
 
 
 @partial(jax.jit, static_argnums=1)
-def _split_unrolled(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
-    index = jax.lax.iota(jnp.uint32, num)
-    words = threefry(jax.random.key_data(key), jnp.zeros_like(index), index)
-    words = stored(jnp.stack(words, axis=1))
-    return jax.random.wrap_key_data(words, impl="threefry2x32")
+def _hashes(key: UInt32[Array, " 2"], num: int) -> UInt32[Array, "num 2"]:
+    """The hashes of so many numbers from 0 under the key."""
+
+    def of_numbers(key: UInt32[Array, " 2"]) -> UInt32[Array, "n 2"]:
+        # Not one array beside the other, for which the rounds would be compiled twice.
+        place = jax.lax.iota(jnp.uint32, 2 * max(num, _FEW_KEYS))
+        high, low = threefry(key, jnp.zeros_like(place), place >> 1)
+        return jnp.where(place & 1 == 0, high, low).reshape(-1, 2)
+
+    return apart(of_numbers, key)[:num]
 
 
 def uniform(
@@ -187,7 +200,10 @@ def _random_bits(key: UInt32[Array, " 2"], bit_width: int, shape: tuple[int, ...
 @partial(jax.jit, static_argnames="shape")
 def _words(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "..."]:
     """The word of each position: both halves of its hash, xored."""
-    index = jax.lax.iota(jnp.uint32, math.prod(shape)).reshape(shape)
+    if (size := math.prod(shape)) <= _FEW_KEYS:
+        hashes = _hashes(key, size)
+        return (hashes[:, 0] ^ hashes[:, 1]).reshape(shape)
+    index = jax.lax.iota(jnp.uint32, size).reshape(shape)
     high, low = threefry(key, jnp.zeros_like(index), index)
     return high ^ low
 

@@ -11,8 +11,9 @@ the right result for every run, the runs can choose together: if one needs it, a
 An operation has one form for CPUs and another for all other platforms.
 """
 
+import inspect
 from collections.abc import Callable
-from functools import partial
+from functools import partial, wraps
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,8 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Int, Key, PyTree, Shaped
 
+# JAX 0.6 marks all operations within a context, and later versions those that made a value too.
+_MARKS_VALUES = "x" in inspect.signature(set_xla_metadata).parameters
 _only_the_default_forms = False  # set by tests, which try them without a GPU
 VECTOR = 32
 # Powers of two fill the vectors; sizes far from 32 make more rows or longer products.
@@ -68,7 +71,15 @@ def stored(values: Shaped[Array, "*rest n"]) -> Shaped[Array, "*rest n"]:
     XLA would compute them again wherever they are used: once for every particle, even if there is
     one for each component, and without vectors in a scatter or gather over flattened rows.
     """
-    return on_platform(values, cpu=_through_a_call, default=_same)
+    # In the blocks of the prefix sums, so that there is no division within the loop.
+    *rest, n = values.shape
+    size = block_size(n)
+    blocks = values.reshape(*rest, -1, size) if n % size == 0 else values
+    return apart(_same, blocks).reshape(values.shape)
+
+
+def _same(values: Array) -> Array:
+    return values
 
 
 @stored.defjvp
@@ -76,18 +87,30 @@ def _stored_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return stored(*primals), tangents[0]
 
 
-def _through_a_call(values: Array) -> Array:
-    # In the blocks of the prefix sums, so that there is no division within the loop.
-    *rest, n = values.shape
-    size = block_size(n)
-    blocks = values.reshape(*rest, -1, size) if n % size == 0 else values
-    with set_xla_metadata(inlineable="false"):
-        return _same(blocks).reshape(values.shape)
+def apart(function: Callable[..., PyTree], *operands: PyTree, **marks: str) -> PyTree:
+    """`function(*operands)`, which XLA on a CPU compiles apart from what is around it.
+
+    What is the same, operation by operation, is then compiled once.
+    """
+    function = jax.jit(function)  # so that it is traced once for both forms
+    marks = {"inlineable": "false"} | marks
+
+    def call(*operands: PyTree) -> PyTree:
+        if _MARKS_VALUES:
+            return set_xla_metadata(function(*operands), **marks)
+        with set_xla_metadata(**marks):
+            return function(*operands)
+
+    return on_platform(*operands, cpu=call, default=function)
 
 
-@jax.jit
-def _same(values: Array) -> Array:
-    return values
+def in_one_kernel(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """The function of some numbers as one kernel on a CPU, where XLA has one for each operation.
+
+    Each kernel takes a hundredth of a second to compile, and part of a microsecond to start. XLA
+    compiles a short loop as one kernel; the call has the mark of such a loop.
+    """
+    return wraps(function)(partial(apart, function, xla_cpu_small_call="true"))
 
 
 def take(values: Array, indices: Int[Array, " n"]) -> Array:

@@ -14,7 +14,7 @@ from mpfjax.memory import memories_of
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.series import Series
 from mpfjax.operations.islands import num_islands
-from mpfjax.operations.random import split
+from mpfjax.operations.random import split, split_each
 from mpfjax.report import StepInfo
 from mpfjax.running.results import FilterRun
 
@@ -28,8 +28,7 @@ def scan(
 ) -> FilterRun:
     """`run_filter` under the caller's jit, its arguments unchecked, from an `initial` mixture."""
     step_keys = split(split(key, 2)[1], series.length)
-    # Not by `vmap`, under which keys of some generators are split differently.
-    keys = jax.lax.map(lambda key: split(key, len(filter.moves)), step_keys)
+    keys = split_each(step_keys, len(filter.moves))
 
     def advance(mixture: ParticleMixture, step: PyTree) -> tuple[ParticleMixture, PyTree]:
         step_keys, now = step
