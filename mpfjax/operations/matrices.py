@@ -104,9 +104,7 @@ def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
     return factors
 
 
-def solve_lower(
-    factors: Float[Array, "#n d d"], vectors: Float[Array, "n d"]
-) -> Float[Array, "n d"]:
+def solve_lower(factors: Float[Array, "#n d d"], vectors: Float[Array, "n d"]) -> Array:
     """F⁻¹ v of lower triangular F, by forward substitution; one F for all, or one for each.
 
     It is written out for the same reason as `cholesky`. LAPACK's own has also been seen to hang

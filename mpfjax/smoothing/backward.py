@@ -25,9 +25,7 @@ MOST_DENSITIES = 2**22
 NO_TRANSITION = "model: log_transition is -inf, or NaN, from every particle of the step before"
 
 
-def draw(
-    key: Key[Array, ""], shape: tuple[int, ...], log_weights: Float[Array, " n"]
-) -> Int[Array, "..."]:
+def draw(key: Key[Array, ""], shape: tuple[int, ...], log_weights: Float[Array, " n"]) -> Array:
     """Indices by their weights, by the inverse of the cumulative weights."""
     n, dtype = log_weights.shape[0], log_weights.dtype
     weights = exp(log_weights - finite_or_zero(jnp.max(log_weights)))
@@ -45,9 +43,7 @@ def draw(
     return jnp.minimum(indices, jnp.max(jnp.where(weights > 0, place, 0)))
 
 
-def draw_ends(
-    key: Key[Array, ""], mixtures: ParticleMixture, number: int
-) -> tuple[Int[Array, " k"], PyTree]:
+def draw_ends(key: Key[Array, ""], mixtures: ParticleMixture, number: int) -> tuple[Array, PyTree]:
     """Indices and states of particles of the last mixture by their weights."""
     final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
     indices = draw(key, (number,), final.log_weights)

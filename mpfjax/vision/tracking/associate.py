@@ -25,9 +25,7 @@ Table, Places = Float[np.ndarray, "m bins"], Float[np.ndarray, "d k"]
 Costs = Float[np.ndarray, "m d"]
 
 
-def compatible(
-    a: Int[np.ndarray, "*#classes"], b: Int[np.ndarray, "*#classes"]
-) -> Bool[np.ndarray, "*classes"]:
+def compatible(a: Int[np.ndarray, "*#classes"], b: Int[np.ndarray, "*#classes"]) -> np.ndarray:
     """Whether classes are the same, or one of them is 0 for none."""
     return (a == b) | (a == 0) | (b == 0)
 
