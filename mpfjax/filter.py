@@ -14,17 +14,7 @@ from mpfjax.models.base import AbstractStateSpaceModel, periods_of, with_inputs
 from mpfjax.models.law import law_of
 from mpfjax.models.noise import Noise
 from mpfjax.models.observations import one_input, one_observation
-from mpfjax.moves.base import (
-    AbstractMove,
-    AbstractPropagation,
-    Moves,
-    Step,
-    all_of,
-    as_moves,
-    check_keep_parents,
-    memory_of,
-    name_of,
-)
+from mpfjax.moves import base
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import drawn_once
@@ -54,8 +44,8 @@ class Filter(eqx.Module):
     """
 
     model: AbstractStateSpaceModel
-    moves: Moves
-    initial_moves: Moves
+    moves: base.Moves
+    initial_moves: base.Moves
     num_particles: int = eqx.field(static=True)
     num_components: int = eqx.field(static=True)
     initial_noise: Noise = eqx.field(static=True)
@@ -73,8 +63,8 @@ class Filter(eqx.Module):
         initial_noise: Noise = "independent",
     ) -> None:
         self.model = model
-        self.moves = as_moves(moves, "moves")
-        self.initial_moves = as_moves(initial_moves, "initial_moves")
+        self.moves = base.as_moves(moves, "moves")
+        self.initial_moves = base.as_moves(initial_moves, "initial_moves")
         self.num_particles, self.num_components = int(num_particles), int(num_components)
         self.initial_noise = initial_noise
         self._keeps_parents = any(move.needs_parents for move in self.moves)
@@ -84,18 +74,18 @@ class Filter(eqx.Module):
             which = f"is less than num_components, {self.num_components}"
             raise ValueError(f"num_particles: {self.num_particles} {which}")
         if not any(move.weighs for move in self.moves):
-            who = f"moves: {', '.join(map(name_of, self.moves)) or 'none'}"
+            who = f"moves: {', '.join(map(base.name_of, self.moves)) or 'none'}"
             raise ValueError(f"{who} never weigh the particles by what is observed, as Propagate")
         now, moves = self._now(), (*self.initial_moves, *self.moves)
         if (check := getattr(self.model, "check_moves", None)) is not None:
-            check(all_of(moves))
+            check(base.all_of(moves))
         for move in moves:
             move.check(now, self.num_particles, self.num_components)
-        memory_of(self.moves, now, self.num_components)
+        base.memory_of(self.moves, now, self.num_components)
         if self._keeps_parents:
             each = enumerate(self.moves)
-            first = next((t for t, move in each if isinstance(move, AbstractPropagation)), 0)
-            check_keep_parents("moves", self.moves[first:], "another move")
+            first = next((t for t, move in each if isinstance(move, base.AbstractPropagation)), 0)
+            base.check_keep_parents("moves", self.moves[first:], "another move")
 
     @property
     def approximate(self) -> bool:
@@ -173,9 +163,9 @@ class Filter(eqx.Module):
 
     def _now(
         self, observation: PyTree = None, inputs: PyTree = None, is_initial: bool = False
-    ) -> Step:
+    ) -> base.Step:
         """The step with this y_t and u_t."""
-        return Step(with_inputs(self.model, inputs), observation, inputs, self, is_initial)
+        return base.Step(with_inputs(self.model, inputs), observation, inputs, self, is_initial)
 
     def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
         return law_of(self.model).sample_initial(key, self.num_particles, self.initial_noise)
@@ -194,7 +184,7 @@ class Filter(eqx.Module):
             particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
         mixture = single_component(particles, self.num_components)
         now = self._now(observation, inputs, is_initial=True)
-        mixture = mixture.replace(memory=memory_of(self.moves, now, self.num_components))
+        mixture = mixture.replace(memory=base.memory_of(self.moves, now, self.num_components))
         for move_key, move in zip(keys, self.initial_moves, strict=True):
             mixture = move(move_key, mixture, now)
         if self.weighs_initially:
@@ -212,7 +202,7 @@ class Filter(eqx.Module):
         """A step; without an observation it only predicts."""
         now, mixture = self._now(observation, inputs), mixture.at_step()
         for move_key, move in zip(split(key, len(self.moves)), self.moves, strict=True):
-            if self._keeps_parents and isinstance(move, AbstractPropagation):
+            if self._keeps_parents and isinstance(move, base.AbstractPropagation):
                 mixture = mixture.with_parents()
             moved = check_result(move(move_key, mixture, now), mixture, move)
             if observation is not None and not move.keeps_mass:
@@ -227,13 +217,13 @@ _one_step = jit_with_floats_traced(Filter._step)
 _start = jit_with_floats_traced(Filter._init)
 
 
-def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> ParticleMixture:
+def check_result(moved: Any, mixture: ParticleMixture, move: base.AbstractMove) -> ParticleMixture:
     """The result of a move; a `ValueError` unless it is a mixture of the same shapes and types."""
     if not isinstance(moved, ParticleMixture):
-        who = f"moves: {name_of(move)} returned"
+        who = f"moves: {base.name_of(move)} returned"
         raise ValueError(f"{who} {shown(moved)}, no ParticleMixture")
     expected = kinds((mixture.particles, mixture.log_weights, mixture.component_indicators))
     actual = kinds((moved.particles, moved.log_weights, moved.component_indicators))
     if actual != expected:
-        raise ValueError(f"moves: {name_of(move)} returned {actual}, and was given {expected}")
+        raise ValueError(f"moves: {base.name_of(move)} returned {actual}, and was given {expected}")
     return moved

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from mpfjax import transforms
 from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead
@@ -30,12 +31,6 @@ from mpfjax.moves.regrouping.partitions import Pool, RandomPartition
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration, RegenerateObjects
 from mpfjax.moves.resampling.resample import Resample, Scheme
-from mpfjax.transforms import (
-    with_initial_selection,
-    with_lookahead,
-    with_quasi_monte_carlo,
-    with_score_gradient,
-)
 
 Importance = Literal["propagated", "predictive_gaussian"]
 # K-means starts from the components of a few steps before, and needs few iterations.
@@ -82,7 +77,9 @@ def auxiliary_particle_filter(
     narrow and y_t determines early which particles will survive. The filter is `with_lookahead`
     applied to a `particle_filter`, and can be applied to any other filter in the same way.
     """
-    return with_lookahead(particle_filter(model, num_particles, proposal=proposal), lookahead)
+    return transforms.with_lookahead(
+        particle_filter(model, num_particles, proposal=proposal), lookahead
+    )
 
 
 @checked
@@ -132,9 +129,9 @@ def mixture_particle_filter(
     options = _grouping_options(model, features, scale)
     filter = _mixture(plain, max_components, options, _WARM_ITERATIONS, regroup, regroup_every)
     if max_components > 1:
-        filter = with_initial_selection(filter)
+        filter = transforms.with_initial_selection(filter)
     if noise == "rqmc" and proposal is None and not is_marginalised(model):
-        filter = with_lookahead(filter)
+        filter = transforms.with_lookahead(filter)
     return _with(noise, gradient, filter)
 
 
@@ -339,5 +336,5 @@ def _mixture(
 
 def _with(noise: str, gradient: str, filter: Filter) -> Filter:
     """The filter with the two options of recipes that are transforms."""
-    filter = with_quasi_monte_carlo(filter) if noise == "rqmc" else filter
-    return with_score_gradient(filter) if gradient == "stop" else filter
+    filter = transforms.with_quasi_monte_carlo(filter) if noise == "rqmc" else filter
+    return transforms.with_score_gradient(filter) if gradient == "stop" else filter

@@ -7,14 +7,7 @@ from typing import Any
 from mpfjax.checks import Count, InnerShare, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead, PilotLookahead
-from mpfjax.moves.base import (
-    AbstractMove,
-    AbstractPropagation,
-    AbstractPropagationOfEach,
-    AbstractProposal,
-    all_of,
-    name_of,
-)
+from mpfjax.moves import base
 from mpfjax.moves.initial import SelectInitial, require_propagation
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
@@ -32,14 +25,14 @@ def map_moves(filter: Filter, change: Callable[[Any], Any]) -> Filter:
 
         map_moves(filter, lambda m: Resample("stratified") if isinstance(m, Resample) else m)
     """
-    return _change(filter, AbstractMove, change, within=True)
+    return _change(filter, base.AbstractMove, change, within=True)
 
 
 def _change(filter: Filter, kind: Any, change: Callable, within: bool = False) -> Filter:
     """The filter with its moves of this kind changed, also those within propagations or not."""
 
-    def visit(move: AbstractMove) -> Any:
-        enters = within or not isinstance(move, AbstractPropagation)
+    def visit(move: base.AbstractMove) -> Any:
+        enters = within or not isinstance(move, base.AbstractPropagation)
         move = move.map_inner(visit) if enters else move
         return change(move) if isinstance(move, kind) else move
 
@@ -81,9 +74,9 @@ def with_score_gradient(filter: Filter) -> Filter:
     choices derivatives ignore (`biases_score`).
     """
     changed = _everywhere(filter, "gradient", "stop")
-    for move in all_of((*changed.initial_moves, *changed.moves)):
+    for move in base.all_of((*changed.initial_moves, *changed.moves)):
         if move.biases_score:
-            raise ValueError(f"filter: derivatives do not see all that {name_of(move)} draws")
+            raise ValueError(f"filter: derivatives do not see all that {base.name_of(move)} draws")
     return changed
 
 
@@ -97,11 +90,11 @@ def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
     """
     require_propagation(filter._now(), "each particle draws")
 
-    def nested(move: Any) -> AbstractPropagationOfEach:
+    def nested(move: Any) -> base.AbstractPropagationOfEach:
         plain = move.propagate if isinstance(move, PropagateNested) else move
         return plain if num_draws == 1 else PropagateNested(plain, num_draws)
 
-    return _change(filter, AbstractPropagationOfEach, nested)
+    return _change(filter, base.AbstractPropagationOfEach, nested)
 
 
 @checked
@@ -115,20 +108,20 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
     """
     plain = _change(filter, AuxiliaryResample, lambda move: move.resample)
     look = _lookahead_of(plain) if lookahead is None else lookahead
-    if not any(isinstance(move, Resample) for move in all_of(plain.moves, within=False)):
+    if not any(isinstance(move, Resample) for move in base.all_of(plain.moves, within=False)):
         raise ValueError("filter: none of its moves is a Resample, which could look ahead")
 
     def guided(move: Propagate) -> Propagate:
         return dataclasses.replace(move, proposal=look) if move.proposal is None else move
 
     ahead = _change(plain, Resample, lambda move: AuxiliaryResample(move, look))
-    is_proposal = isinstance(look, AbstractProposal)
+    is_proposal = isinstance(look, base.AbstractProposal)
     return _change(ahead, Propagate, guided) if is_proposal else ahead
 
 
 def _lookahead_of(filter: Filter) -> Lookahead:
     """The look-ahead of the proposal by which the filter draws x_t, or of the model alone."""
-    proposals: list[Any] = [getattr(move, "proposal", None) for move in all_of(filter.moves)]
+    proposals: list[Any] = [getattr(move, "proposal", None) for move in base.all_of(filter.moves)]
     lookaheads = [proposal for proposal in proposals if hasattr(proposal, "log_normaliser")]
     return lookaheads[0] if lookaheads else PilotLookahead()
 
@@ -213,7 +206,7 @@ def _everywhere(filter: Filter, field: str, value: str) -> Filter:
     """The filter with another value of a field in all moves that have it, also inner ones."""
 
     def set_field(node: Any) -> Any:
-        if not isinstance(node, AbstractMove) or field not in node.__dataclass_fields__:
+        if not isinstance(node, base.AbstractMove) or field not in node.__dataclass_fields__:
             return node
         return dataclasses.replace(node, **{field: value})
 

@@ -8,14 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.models.base import (
-    asking,
-    check_moved,
-    check_states,
-    is_made_of_noise,
-    model_name,
-    real_each,
-)
+from mpfjax.models import base
 from mpfjax.models.noise import draw_noise
 from mpfjax.operations.logarithms import default_float
 
@@ -39,7 +32,7 @@ class Law:
     @property
     def is_of_noise(self) -> bool:
         """Whether x_t can be made of noise."""
-        return is_made_of_noise(self.model)
+        return base.is_made_of_noise(self.model)
 
     def part(self, states: PyTree) -> PyTree:
         """The random part of the states."""
@@ -55,9 +48,9 @@ class Law:
 
     def sample_initial(self, key: Key[Array, ""], size: int, noise: str = "independent") -> PyTree:
         """x_0 of so many particles, made of this noise if the model has `initial_from_noise`."""
-        if noise == "independent" or not is_made_of_noise(self.model, "initial"):
+        if noise == "independent" or not base.is_made_of_noise(self.model, "initial"):
             draws = self.model.sample_initial(key, size)
-            check_states(draws, self.model, "sample_initial", size)
+            base.check_states(draws, self.model, "sample_initial", size)
             return self.start(draws)
         shape = (size, self.model.initial_noise_dimension)
         return self.make_initial(draw_noise(key, noise, shape, default_float()))
@@ -65,7 +58,7 @@ class Law:
     def make_initial(self, noise: Float[Array, "n k"]) -> PyTree:
         """x_0 of each particle, made of this standard normal noise."""
         draws = self.model.initial_from_noise(noise)
-        check_states(draws, self.model, "initial_from_noise", noise.shape[0])
+        base.check_states(draws, self.model, "initial_from_noise", noise.shape[0])
         return self.start(draws)
 
     def log_initial(self, states: PyTree) -> Float[Array, " n"]:
@@ -79,17 +72,17 @@ class Law:
     def draw(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """The random part of x_t."""
         before = self.part(states)
-        with asking(self.model, "sample_transition"):
+        with base.asking(self.model, "sample_transition"):
             draws = self.model.sample_transition(key, before)
-        check_moved(draws, before, self.model)
+        base.check_moved(draws, before, self.model)
         return draws
 
     def make(self, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
         """The random part of x_t, made of this standard normal noise."""
         before = self.part(states)
-        with asking(self.model, "transition_from_noise", "of noise_dimension", noise):
+        with base.asking(self.model, "transition_from_noise", "of noise_dimension", noise):
             draws = self.model.transition_from_noise(noise, before)
-        check_moved(draws, before, self.model, "transition_from_noise")
+        base.check_moved(draws, before, self.model, "transition_from_noise")
         return draws
 
     def noise_dimension(self, states: PyTree) -> int:
@@ -101,9 +94,9 @@ class Law:
         return self._log_density("log_transition", draws, self.part(states))
 
     def _log_density(self, method: str, draws: PyTree, *previous: PyTree) -> Float[Array, " n"]:
-        with asking(self.model, method):
+        with base.asking(self.model, method):
             values = getattr(self.model, method)(draws, *previous)
-        return real_each(values, jax.tree.leaves(draws)[0].shape[0], self.model, method)
+        return base.real_each(values, jax.tree.leaves(draws)[0].shape[0], self.model, method)
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """log L(y_t | x_t) of each particle; with x integrated out where it has moments."""
@@ -113,10 +106,10 @@ class Law:
         """log L of what depends on the random part alone: the model's own `log_likelihood`."""
         hint = " (one number of each array in a list; jnp.asarray(observations) is one array)"
         name = "the observation" + hint * isinstance(observation, list)
-        with asking(self.model, "log_likelihood", name, observation):
+        with base.asking(self.model, "log_likelihood", name, observation):
             values = self.model.log_likelihood(observation, draws)
         number = jax.tree.leaves(draws)[0].shape[0]
-        return real_each(values, number, self.model, "log_likelihood")
+        return base.real_each(values, number, self.model, "log_likelihood")
 
     def see(self, observation: PyTree, states: PyTree) -> tuple[PyTree, list[Float[Array, " n"]]]:
         """The states updated by y_t, and the factors of log L(y_t | x_t) of each particle."""
@@ -124,10 +117,10 @@ class Law:
 
     def observe(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """y_t of each particle, drawn by the model's `sample_observation`."""
-        with asking(self.model, "sample_observation"):
+        with base.asking(self.model, "sample_observation"):
             observations = self.model.sample_observation(key, states)
         number = jax.tree.leaves(states)[0].shape[0]
-        check_states(observations, self.model, "sample_observation", number)
+        base.check_states(observations, self.model, "sample_observation", number)
         return observations
 
 
@@ -141,5 +134,5 @@ def refuse_marginalised(
 ) -> None:
     """Raise a `ValueError` for a model that is not propagated as a whole."""
     if not law_of(model).is_whole:
-        who = f"{name}: {model_name(model)} is conditionally linear"
+        who = f"{name}: {base.model_name(model)} is conditionally linear"
         raise ValueError(f"{who}, and {needed_by} needs states drawn as a whole; {instead}")

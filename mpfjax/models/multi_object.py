@@ -13,13 +13,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from mpfjax.arrays import POSITIVE, Fitting, to_array
 from mpfjax.checks import Checked, Count, check_one_each
 from mpfjax.mixture import flatten_states
-from mpfjax.models.base import (
-    AbstractStateSpaceModel,
-    is_made_of_noise,
-    real_each,
-    replace_fields,
-    with_inputs,
-)
+from mpfjax.models import base
 from mpfjax.models.law import Law, refuse_marginalised
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.random import split
@@ -29,7 +23,7 @@ from mpfjax.operations.stored import select_rows
 _TRIAL = 1_000_003
 
 
-class MultiObjectModel(AbstractStateSpaceModel, Checked):
+class MultiObjectModel(base.AbstractStateSpaceModel, Checked):
     """x_t = (x_t^1, ..., x_t^J): J objects, each with its own dynamics and likelihood.
 
     Smith and Gatica-Perez (2004), section 2: D is a product over the objects, and so is L(y_t |
@@ -54,7 +48,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
     share particles; without interaction `independent_particle_filters` is better.
     """
 
-    object_model: AbstractStateSpaceModel
+    object_model: base.AbstractStateSpaceModel
     num_objects: Count = eqx.field(static=True)
     interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None = None
     shared_observation: bool = eqx.field(static=True, default=False)
@@ -77,10 +71,10 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
 
     def with_inputs(self, inputs: PyTree) -> "MultiObjectModel":
         """The model whose objects all have the inputs u_t."""
-        give = partial(with_inputs, inputs=inputs)
+        give = partial(base.with_inputs, inputs=inputs)
         if self.per_object:
             give = eqx.filter_vmap(give, in_axes=eqx.if_array(0), axis_size=self.num_objects)
-        return replace_fields(self, object_model=give(self.object_model))
+        return base.replace_fields(self, object_model=give(self.object_model))
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """x_0 of every object, independent: every leaf (n, J, ...)."""
@@ -120,7 +114,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
         if name == "log_transition" and hasattr(self.object_model, name):
             return self._log_transition
         is_of_noise = name in ("transition_from_noise", "noise_dimension")
-        if is_of_noise and is_made_of_noise(self.object_model):
+        if is_of_noise and base.is_made_of_noise(self.object_model):
             return getattr(self, f"_{name}")
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
@@ -209,7 +203,7 @@ class MultiObjectModel(AbstractStateSpaceModel, Checked):
         differ = objects.ndim > 0 and (self.per_object or not self.shared_observation)
         values = _one_by_one(weigh, objects, states) if differ else weigh(objects, states)
         num_particles = jax.tree.leaves(states)[0].shape[0]
-        return real_each(values, num_particles, self.object_model, "log_likelihood")
+        return base.real_each(values, num_particles, self.object_model, "log_likelihood")
 
     def object_log_transition(
         self, states: PyTree, previous_states: PyTree, objects: Int[Array, "*n"]

@@ -7,17 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
+from mpfjax.operations import random
 from mpfjax.operations.logarithms import default_float
-from mpfjax.operations.random import (
-    bits,
-    normal,
-    normal_quantile,
-    scramble,
-    scrambled_directions,
-    sobol_points,
-    split,
-    uniform,
-)
 from mpfjax.operations.segments import first_places, spread
 from mpfjax.operations.stored import stored
 
@@ -55,15 +46,15 @@ def draw_noise(
     would be functions of each other. `shuffle` deals the points anew.
     """
     if kind == "independent":
-        return normal(key, shape, dtype)
+        return random.normal(key, shape, dtype)
     n, d = shape
-    key_first, key_second = split(key, 2)
+    key_first, key_second = random.split(key, 2)
     if kind == "stratified":
         ranks = _scramble_ranks(key_second, jnp.arange(n, dtype=jnp.int32)).astype(jnp.uint32)
-        points = ranks[:, None] * _multipliers(d)[None] + bits(key_first, (d,))[None]
+        points = ranks[:, None] * _multipliers(d)[None] + random.bits(key_first, (d,))[None]
         return normal_of(points, dtype)
     ranks = jnp.arange(n, dtype=jnp.int32)
-    shifts = stored(bits(key_second, (num_components, d)) >> _UNUSED)
+    shifts = stored(random.bits(key_second, (num_components, d)) >> _UNUSED)
     if components is None or num_components == 1:
         shifts = shifts.T << _UNUSED
     else:
@@ -75,14 +66,14 @@ def draw_noise(
     if d == 1:
         points = (ranks.astype(jnp.uint32) * _multipliers(1))[None] + shifts
     else:
-        directions = scrambled_directions(key_first, d, _num_digits(n))
-        points = sobol_points(ranks, directions) ^ shifts
+        directions = random.scrambled_directions(key_first, d, _num_digits(n))
+        points = random.sobol_points(ranks, directions) ^ shifts
     # Drawn row by row, then transposed: operations on short rows are not vectorised.
     return stored(normal_of(points, dtype)).T
 
 
 def _scramble_ranks(key: Key[Array, ""], ranks: Int[Array, " n"]) -> Int[Array, " n"]:
-    dealt = scramble(ranks, bits(key, ()), _num_digits(ranks.shape[0]))
+    dealt = random.scramble(ranks, random.bits(key, ()), _num_digits(ranks.shape[0]))
     return stored(dealt.astype(jnp.int32))
 
 
@@ -92,7 +83,7 @@ def _num_digits(num_ranks: int) -> int:
 
 def normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
     """Quantiles of the standard normal at points in units of 2^-32."""
-    return normal_quantile(2 * uniform_of(points, dtype) - 1)
+    return random.normal_quantile(2 * uniform_of(points, dtype) - 1)
 
 
 def uniform_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
@@ -108,7 +99,7 @@ def stratified_uniform(key: Key[Array, ""], num_points: int) -> Float[Array, " n
     Use it for draws of equal weight, such as x_0.
     """
     cells = jnp.arange(num_points).astype(jnp.result_type(float))
-    return (cells + uniform(key, (num_points,))) / num_points
+    return (cells + random.uniform(key, (num_points,))) / num_points
 
 
 def noise_dtype(states: PyTree) -> jnp.dtype:
