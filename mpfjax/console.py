@@ -18,7 +18,9 @@ from typing import Any
 from tqdm import tqdm
 
 
-def _read_by(kind: Callable[[str], Any], holds: Callable, what: str) -> Callable[[str], Any]:
+def _read_by(
+    kind: Callable[[str], Any], holds: Callable[[Any], bool], what: str
+) -> Callable[[str], Any]:
     def read(text: str) -> Any:
         with contextlib.suppress(ValueError):
             if holds(number := kind(text)):

@@ -28,7 +28,9 @@ def map_moves(filter: Filter, change: Callable[[Any], Any]) -> Filter:
     return _change(filter, base.AbstractMove, change, within=True)
 
 
-def _change(filter: Filter, kind: Any, change: Callable, within: bool = False) -> Filter:
+def _change(
+    filter: Filter, kind: Any, change: Callable[[Any], Any], within: bool = False
+) -> Filter:
     """The filter with its moves of this kind changed, also those within propagations or not."""
 
     def visit(move: base.AbstractMove) -> Any:

@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -162,7 +161,9 @@ class LocalQuadratics(eqx.Module):
         return jax.lax.map(function, jnp.arange(self.centres.shape[-2], dtype=jnp.int32))
 
 
-def neutral(num_experts: int, num_features: int, num_noises: int, dtype: Any) -> LocalQuadratics:
+def neutral(
+    num_experts: int, num_features: int, num_noises: int, dtype: jnp.dtype
+) -> LocalQuadratics:
     """ψ = 1: no information about later observations."""
     k, d, j = num_experts, num_features, num_noises
 

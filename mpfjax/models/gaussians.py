@@ -57,7 +57,9 @@ def symmetric(matrix: Float[Array, "d d n"]) -> Float[Array, "d d n"]:
     return 0.5 * (matrix + transpose(matrix))
 
 
-def sandwich(matrix: Float[Array, "d k #n"], covariance: Float[Array, "k k #n"]) -> Squares:
+def sandwich(
+    matrix: Float[Array, "d k #n"], covariance: Float[Array, "k k #n"]
+) -> Float[Array, "d d n"]:
     """A P Aᵀ, symmetric to the bit."""
     return symmetric(product(product(matrix, covariance), transpose(matrix)))
 
@@ -126,7 +128,9 @@ def log_normal(
     return -0.5 * (residuals / deviations) ** 2 - jnp.log(deviations) - 0.5 * jnp.log(2 * jnp.pi)
 
 
-def log_multinormal(residuals: Float[Array, "n d"], covariance: Float[Array, "d d"]) -> Array:
+def log_multinormal(
+    residuals: Float[Array, "n d"], covariance: Float[Array, "d d"]
+) -> Float[Array, " n"]:
     """log N(r; 0, Σ) of each row, with one small solve whatever the number of rows."""
     factor = jnp.linalg.cholesky(covariance)
     identity = jnp.eye(len(factor), dtype=factor.dtype)

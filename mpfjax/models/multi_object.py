@@ -268,7 +268,9 @@ def _is_array(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array | np.ndarray)
 
 
-def _one_by_one(function: Callable, objects: Int[Array, " n"], *states: PyTree) -> PyTree:
+def _one_by_one(
+    function: Callable[..., PyTree], objects: Int[Array, " n"], *states: PyTree
+) -> PyTree:
     """A function of an object and states of n particles, called for each particle alone."""
 
     def of_one(j: Int[Array, ""], *states: PyTree) -> PyTree:

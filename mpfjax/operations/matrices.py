@@ -104,7 +104,9 @@ def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
     return factors
 
 
-def solve_lower(factors: Float[Array, "#n d d"], vectors: Float[Array, "n d"]) -> Array:
+def solve_lower(
+    factors: Float[Array, "#n d d"], vectors: Float[Array, "n d"]
+) -> Float[Array, "n d"]:
     """F⁻¹ v of lower triangular F, by forward substitution; one F for all, or one for each.
 
     It is written out for the same reason as `cholesky`. LAPACK's own has also been seen to hang

@@ -23,7 +23,6 @@ from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.stored import apart, on_platform, stored
 
 Words = UInt32[Array, " *shape"]
-Directions = UInt32[Array, "d digits"]  # of a Sobol sequence
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
 _SHORT_ROW = 8
@@ -103,7 +102,9 @@ def _hashes(key: UInt32[Array, " 2"], num: int) -> UInt32[Array, "num 2"]:
     return apart(of_numbers, key)[:num]
 
 
-def uniform(key: Key[Array, ""], shape: tuple[int, ...], dtype: DTypeLike | None = None) -> Array:
+def uniform(
+    key: Key[Array, ""], shape: tuple[int, ...], dtype: DTypeLike | None = None
+) -> Float[Array, "..."]:
     """`jax.random.uniform` on [0, 1), the same numbers in less time on a CPU."""
     return jax.random.uniform(fast_key(key), shape, float if dtype is None else dtype)
 
@@ -128,7 +129,9 @@ def below(key: Key[Array, ""], spans: Int[Array, "*shape"]) -> Int[Array, "*shap
     return high.astype(jnp.int32)
 
 
-def normal(key: Key[Array, ""], shape: tuple[int, ...], dtype: DTypeLike | None = None) -> Array:
+def normal(
+    key: Key[Array, ""], shape: tuple[int, ...], dtype: DTypeLike | None = None
+) -> Float[Array, "..."]:
     """Standard normal draws: those of `jax.random.normal`, up to rounding, in less time on a CPU.
 
     It is √2 erf⁻¹(u) of the same uniform u on (-1, 1). That is for float32 on a CPU; elsewhere it
@@ -252,7 +255,9 @@ def direction_numbers(dimension: int, num_digits: int) -> np.ndarray:
     return (np.transpose(numbers) * 2.0**_DIGITS).astype(np.uint32)
 
 
-def sobol_points(indices: Int[Array, " n"], directions: Directions) -> UInt32[Array, "d n"]:
+def sobol_points(
+    indices: Int[Array, " n"], directions: UInt32[Array, "d digits"]
+) -> UInt32[Array, "d n"]:
     """The points of these indices, a row for each dimension, in units of 2^-32.
 
     `directions` need as many digits as the largest index has.
@@ -290,7 +295,9 @@ def _reversed_bits(words: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
     return words
 
 
-def scrambled_directions(key: Key[Array, ""], dimension: int, num_digits: int) -> Directions:
+def scrambled_directions(
+    key: Key[Array, ""], dimension: int, num_digits: int
+) -> UInt32[Array, "d digits"]:
     """Direction numbers times a random lower triangular matrix of digits for each dimension.
 
     The linear matrix scramble of Matoušek (1998): digit k of a coordinate becomes itself plus a

@@ -31,7 +31,9 @@ _BLOCKS = (VECTOR, 16, 40, 48, 24, 56, 28, 36, 20, 44, 52)
 EXACT_IN_FLOAT32 = 2**23  # as exact as up to 2^24, and readable from the lowest bits
 
 
-def on_platform(*operands: PyTree, cpu: Callable, default: Callable) -> PyTree:
+def on_platform(
+    *operands: PyTree, cpu: Callable[..., PyTree], default: Callable[..., PyTree]
+) -> PyTree:
     """The result of `cpu` on a CPU, and of `default` elsewhere.
 
     Both give the same numbers, up to rounding.
@@ -141,7 +143,9 @@ def select_rows(is_new: Bool[Array, "*n"], new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(select, new, old)
 
 
-def cond_if_any(is_needed: Bool[Array, ""], costly: Callable, cheap: Callable) -> PyTree:
+def cond_if_any(
+    is_needed: Bool[Array, ""], costly: Callable[[], PyTree], cheap: Callable[[], PyTree]
+) -> PyTree:
     """`costly()` if any run of the caller's `vmap` needs it, `cheap()` otherwise.
 
     For a run that does not need it, `costly()` must give the result of `cheap()`.

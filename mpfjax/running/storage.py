@@ -225,7 +225,9 @@ def write_json(path: Path, content: Any) -> None:
     write_whole(path, lambda file: file.write(text.encode()))
 
 
-def write_described(path: FilePath, arrays: Mapping[str, np.ndarray], description: Mapping) -> None:
+def write_described(
+    path: FilePath, arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]
+) -> None:
     """Write arrays by name as .npz, and a description that JSON can hold; whole or not at all.
 
     `np.load` reads it without pickles. Raises `ValueError` for an array that could not be read so,

@@ -25,7 +25,9 @@ MOST_DENSITIES = 2**22
 NO_TRANSITION = "model: log_transition is -inf, or NaN, from every particle of the step before"
 
 
-def draw(key: Key[Array, ""], shape: tuple[int, ...], log_weights: Float[Array, " n"]) -> Array:
+def draw(
+    key: Key[Array, ""], shape: tuple[int, ...], log_weights: Float[Array, " n"]
+) -> Int[Array, "..."]:
     """Indices by their weights, by the inverse of the cumulative weights."""
     n, dtype = log_weights.shape[0], log_weights.dtype
     weights = exp(log_weights - finite_or_zero(jnp.max(log_weights)))
@@ -43,7 +45,9 @@ def draw(key: Key[Array, ""], shape: tuple[int, ...], log_weights: Float[Array, 
     return jnp.minimum(indices, jnp.max(jnp.where(weights > 0, place, 0)))
 
 
-def draw_ends(key: Key[Array, ""], mixtures: ParticleMixture, number: int) -> tuple[Array, PyTree]:
+def draw_ends(
+    key: Key[Array, ""], mixtures: ParticleMixture, number: int
+) -> tuple[Int[Array, " k"], PyTree]:
     """Indices and states of particles of the last mixture by their weights."""
     final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
     indices = draw(key, (number,), final.log_weights)

@@ -24,7 +24,6 @@ from mpfjax.models.base import with_inputs
 from mpfjax.models.gaussians import (
     Gaussian,
     Linear,
-    Squares,
     apply,
     cholesky,
     particles_first,
@@ -45,7 +44,7 @@ from mpfjax.smoothing.backward import draw_ends, draw_exactly, rows_at
 class Information(NamedTuple):
     """A likelihood of x, exp(-u Ω u / 2 + λ u) with u = x - centre, the trajectories last."""
 
-    precision: Squares
+    precision: Float[Array, "d d #n"]
     vector: Float[Array, "d #n"]
     centre: Float[Array, "d #n"]
 
@@ -160,7 +159,9 @@ def _before(
     return _add(likelihood, Information(sandwich(back, precision), apply(back, vector), law.mean))
 
 
-def _one_plus(precision: Squares, root: Squares) -> Squares:
+def _one_plus(
+    precision: Float[Array, "d d #n"], root: Float[Array, "d d #n"]
+) -> Float[Array, "d d #n"]:
     """The factor of I + Γᵀ Ω Γ."""
     identity = jnp.eye(precision.shape[0], dtype=precision.dtype)[:, :, None]
     return cholesky(identity + sandwich(transpose(root), precision), floor=True)

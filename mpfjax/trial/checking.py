@@ -269,11 +269,13 @@ def _derivative(model, observation, states):
     return eqx.filter_grad(total)(model)
 
 
-def _of_origins(name: str, source: str, state: str, logs: Array, families: PyTree) -> Iterator[str]:
+def _of_origins(
+    method: str, source: str, state: str, logs: Array, families: PyTree
+) -> Iterator[str]:
     """Faults of the log density of draws, each given its own state and its siblings'."""
-    what = "log D" if name == "log_transition" else "log L"
+    what = "log D" if method == "log_transition" else "log L"
     for fault in origin_faults(np.asarray(logs, float), _columns(families), what, state):
-        yield f"{name} {fault.format(source)}"
+        yield f"{method} {fault.format(source)}"
 
 
 @_jit
@@ -294,7 +296,9 @@ def _of_density(name: str, source: str, draws: PyTree, logs: Array) -> Iterator[
             yield f"{name} {fault.format(source)}"
 
 
-def _of_births(key: Key[Array, ""], birth: UniformBirth, scans: tuple) -> Iterator[str]:
+def _of_births(
+    key: Key[Array, ""], birth: UniformBirth, scans: tuple[PyTree, ...]
+) -> Iterator[str]:
     """Faults of the densities of places at the first measurement of each sensor."""
     for k, scan in enumerate(scans):
         leaves = jax.tree.leaves(scan)

@@ -97,7 +97,9 @@ def density_faults(columns: list[np.ndarray], log_densities: np.ndarray) -> Iter
         )
 
 
-def _continuous_part(columns: list[np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
+def _continuous_part(
+    columns: list[np.ndarray],
+) -> tuple[np.ndarray | None, Float[np.ndarray, "n d"]]:
     """Which draws have the most frequent values of what is discrete, and the other columns.
 
     None for the first where too few have, or where nothing is random.

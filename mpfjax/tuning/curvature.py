@@ -151,7 +151,9 @@ def _inverse(information: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"] 
     return np.linalg.inv(relative) * scales
 
 
-def _warn_of_noise(informations: Float[np.ndarray, "batches d d"], covariance: np.ndarray) -> None:
+def _warn_of_noise(
+    informations: Float[np.ndarray, "batches d d"], covariance: Float[np.ndarray, "d d"]
+) -> None:
     """Warn where errors are uncertain: by the delta method, from what each batch adds to them."""
     num_batches, scale = len(informations), np.diagonal(covariance)
     uncertain, by = np.inf, ""

@@ -81,7 +81,9 @@ def extend(key, sampler, samples, t):
     increment (-inf where all are zero), the effective sample size, and how many were dropped.
     """
 
-    def one(key: Key[Array, ""], sample: densities.Point) -> tuple:
+    def one(
+        key: Key[Array, ""], sample: densities.Point
+    ) -> tuple[ParticleMixture, Float[Array, ""]]:
         return sampler.step(key, sampler.problem.at(sample.reals), sample.mixture, t)
 
     points, alive = samples.particles, samples.log_weights > -jnp.inf

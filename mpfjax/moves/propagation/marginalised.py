@@ -170,7 +170,9 @@ def require_regimes(model: Any, needed_by: str) -> None:
     require(model, "all_transitions", needed_by)
 
 
-def children(now: Step, state: MarginalisedState) -> tuple[list[PyTree], Array, Array]:
+def children(
+    now: Step, state: MarginalisedState
+) -> tuple[list[PyTree], Float[Array, "k n"], Float[Array, "k n"]]:
     """The K latents that may follow each particle, log p(z_t | z_{t-1}), and that times p(y_t)."""
     law, pairs = now.law, now.model.all_transitions(state.latent)
     latents, log_priors = [latent for latent, _ in pairs], jnp.stack([log for _, log in pairs])

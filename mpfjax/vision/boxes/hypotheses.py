@@ -5,7 +5,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.checks import check
 from mpfjax.mixture import ParticleMixture
@@ -101,7 +101,9 @@ class AdaptAppearance(AbstractPropagation):
         return mixture.replace(particles=particles)
 
 
-def best_components(mixture: ParticleMixture, num_objects: int) -> tuple[Array, Array]:
+def best_components(
+    mixture: ParticleMixture, num_objects: int
+) -> tuple[Int[Array, " k"], Bool[Array, " k"]]:
     """The heaviest component of each object, and whether the object has one at all."""
     objects = jnp.arange(num_objects, dtype=jnp.int32)
     is_own = component_references(mixture)[None] == objects[:, None]

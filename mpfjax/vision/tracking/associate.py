@@ -25,7 +25,9 @@ Table, Places = Float[np.ndarray, "m bins"], Float[np.ndarray, "d k"]
 Costs = Float[np.ndarray, "m d"]
 
 
-def compatible(a: Int[np.ndarray, "*#classes"], b: Int[np.ndarray, "*#classes"]) -> np.ndarray:
+def compatible(
+    a: Int[np.ndarray, "*#classes"], b: Int[np.ndarray, "*#classes"]
+) -> Bool[np.ndarray, "*classes"]:
     """Whether classes are the same, or one of them is 0 for none."""
     return (a == b) | (a == 0) | (b == 0)
 

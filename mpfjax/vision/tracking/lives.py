@@ -4,11 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.optimize import isotonic_regression
 from scipy.special import expit
 
 from mpfjax.vision.tracking.pairs import Flags, Integers, Numbers, Pairs
-from mpfjax.vision.tracking.scores import KEPT, PRIOR
+from mpfjax.vision.tracking.scores import KEPT, PRIOR, rising
 
 _CONFIRMED = 2  # frames with strong detections after which there is an object
 _TENTATIVE = 1  # frames that it may be missed in before
@@ -68,9 +67,11 @@ class Lives(NamedTuple):
     odds: Numbers
 
     @classmethod
-    def initial(cls, identities: Integers, classes: Integers, sure: Flags, odds: float) -> "Lives":
-        """The lives of new objects; `sure`: which are confirmed, and shown, from the first."""
-        one = np.ones_like(identities)
+    def initial(
+        cls, identities: Integers, classes: Integers, at_once: Flags, odds: float
+    ) -> "Lives":
+        """The lives of new objects; `at_once`: which are confirmed, and shown, from the first."""
+        one, sure = np.ones_like(identities), at_once
         none = 0.0 * one
         return cls(identities, classes, none, one, none, none, sure, sure, none + odds)
 
@@ -140,7 +141,7 @@ class Coasting(NamedTuple):
         prior = expit((half - frames) / (_SCALE * half))
         number = self.right + self.wrong + PRIOR
         values = (self.right + PRIOR * prior) / number
-        bins = np.sum(isotonic_regression(values[::-1], weights=number[::-1]).x >= 0.5)
+        bins = np.sum(rising(values[::-1], number[::-1]) >= 0.5)
         return bins * spans.binned // _BINS
 
 

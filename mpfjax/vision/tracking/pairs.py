@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-# A value for each of m objects, or detections.
+# A value for each of m objects.
 Numbers = Float[np.ndarray, " m"]
 Integers = Int[np.ndarray, " m"]
 Flags = Bool[np.ndarray, " m"]
@@ -51,7 +51,9 @@ class Pairs(NamedTuple):
         mutual = np.append(second, -1)[first] == np.arange(len(first))
         return np.where(mutual, first, -1)
 
-    def block(self, none: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def block(
+        self, none: float
+    ) -> tuple[Float[np.ndarray, "r c"], Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
         """The matrix of the rows and columns that have a pair, and where in it each pair is."""
         (names, rows), (others, columns) = (
             np.unique(each, return_inverse=True) for each in (self.rows, self.columns)

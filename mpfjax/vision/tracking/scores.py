@@ -171,8 +171,7 @@ class ScoreState(NamedTuple):
         """The share above which a detection is more probably an object than none."""
         prior = expit((_CENTRES - STRONG) / _SLOPE)
         number = self.good + self.bad + PRIOR
-        shares = (self.good + PRIOR * prior) / number
-        odds = logit(isotonic_regression(shares, weights=number).x)
+        odds = logit(rising((self.good + PRIOR * prior) / number, number))
         above = int(np.argmax(odds >= 0))
         if odds[-1] < 0:
             return _SURE
@@ -180,3 +179,8 @@ class ScoreState(NamedTuple):
             return 0.0
         part = -odds[above - 1] / (odds[above] - odds[above - 1])
         return float(min(_CENTRES[above - 1] + part / _BINS, _SURE))
+
+
+def rising(values: Float[np.ndarray, " k"], weights: Float[np.ndarray, " k"]) -> np.ndarray:
+    """Isotonic regression: the nearest non-decreasing sequence, by weighted least squares."""
+    return isotonic_regression(values, weights=weights).x

@@ -322,7 +322,9 @@ def _survive(
     return state._replace(lives=lives_now, coasting=coasting), stays
 
 
-def _births(state: TrackerState, frame: _Frame, matches: _Matches, stays: Flags) -> Flags:
+def _births(
+    state: TrackerState, frame: _Frame, matches: _Matches, stays: Flags
+) -> Bool[np.ndarray, " d"]:
     """Which strong detections begin an object: no object has them, or is there already."""
     boxes, classes = frame.detections.boxes, frame.detections.classes
     objects = gaussian.boxes_of(state.objects.place[stays])
@@ -336,7 +338,9 @@ def _births(state: TrackerState, frame: _Frame, matches: _Matches, stays: Flags)
     return is_birth
 
 
-def _end_long_chains(state: TrackerState, frame: _Frame, stays: Flags, born: Born) -> Flags:
+def _end_long_chains(
+    state: TrackerState, frame: _Frame, stays: Flags, born: Born
+) -> Bool[np.ndarray, " b"]:
     """Which births end a chain of weaker detections that has lasted, and are beside no object."""
     objects, boxes = gaussian.boxes_of(state.objects.place[stays]), frame.detections.boxes[born]
     is_long = state.scores.ages[born] >= max(frame.spans.unsure, _LEAST_AGE)
