@@ -74,7 +74,7 @@ class Step(NamedTuple):
     """The result of one step of one chain."""
 
     state: Any  # its `reals` are the parameters
-    report: tuple[Any, ...]  # what is kept of the step, the parameters first
+    report: tuple[Any, ...]  # parameters, their density or path, whether accepted, and the rest
     acceptance: Float[Array, ""]
     num_invalid: Int[Array, ""]  # how often a density was NaN or +inf
 
@@ -117,8 +117,8 @@ class Sampling:
     checkpoint: Checkpoint | None
     progress: bool
 
-    def run(self, kernel: AbstractKernel) -> tuple[list[PyTree], dict[str, Any]]:
-        """What reports hold besides parameters, leaves (chains, draws, ...), and other fields."""
+    def run(self, kernel: AbstractKernel) -> tuple[tuple[PyTree, PyTree], dict[str, Any]]:
+        """The second and the last entry of reports, (chains, draws, ...), and other fields."""
         settings = self.problem.settings | {
             "observations": self.problem.objective, "proposal_deviations": self.deviations,
             "key": self.key, "burn_in": self.burn_in, "num_chains": self.num_chains,
@@ -128,13 +128,13 @@ class Sampling:
         key_starts, key_steps = jax.random.split(self.key)
         chains, none = self._start_chains(kernel, key_starts)
         state, stopped = run.go(State(0, chains, none), self._advance(kernel, key_steps))
-        draws = jax.tree.map(lambda rows: rows[: self.num_steps], state.rows)
-        reals, *rest = jax.tree.map(lambda rows: np.moveaxis(rows, 0, 1), draws)
+        draws = jax.tree.map(lambda rows: np.moveaxis(rows[: self.num_steps], 0, 1), state.rows)
+        reals, values, accepted, others = draws
         num_invalid = np.asarray(state.carry.num_invalid)
         warn_of_invalid(self.caller, int(num_invalid.sum()))
-        return rest, {
+        return (values, others), {
             "parameters": self.problem.constrained_rows(reals), "problem": self.problem,
-            "num_invalid": num_invalid, "stopped": stopped,
+            "num_invalid": num_invalid, "stopped": stopped, "accepted": accepted,
             "one_start": self.num_chains > 1 and self.sample_prior is None,
         }  # fmt: skip
 

@@ -104,10 +104,8 @@ def metropolis_hastings(
     )  # fmt: skip
     prior = densities.checked_prior(log_prior, problem, key, sample_prior)
     density = densities.LogDensity(problem, prior)
-    (values, accepted, key_data), fields = sampling.run(_MetropolisHastings(density))
-    return Posterior(
-        log_marginal_likelihoods=values, accepted=accepted, key_data=key_data, **fields
-    )
+    (values, key_data), fields = sampling.run(_MetropolisHastings(density))
+    return Posterior(log_marginal_likelihoods=values, key_data=key_data, **fields)
 
 
 class _MetropolisHastings(AbstractKernel):
@@ -206,8 +204,8 @@ def particle_gibbs(
         checkpoint, progress,
     )  # fmt: skip
     kernel = _Gibbs(problem, densities.checked_prior(log_prior, problem, key, sample_prior))
-    (paths, accepted, renewed), fields = sampling.run(kernel)
-    return GibbsPosterior(trajectories=paths, accepted=accepted, renewed=renewed, **fields)
+    (paths, renewed), fields = sampling.run(kernel)
+    return GibbsPosterior(trajectories=paths, renewed=renewed, **fields)
 
 
 class _Pair(eqx.Module):

@@ -247,13 +247,6 @@ class _Ascent:
         parts = self.problem.objective.parts(self.batch, rng)
         return [replace(self.problem, objective=part) for part in parts]
 
-    def _at_step(self, step: int) -> tuple[Problem, int]:
-        """The problem of a step's batch, and how many batches there are in its epoch."""
-        num_parts = len(self._parts())
-        epoch, place = divmod(step, num_parts)
-        seed = np.asarray(jax.random.key_data(self.key)).ravel()
-        return self._parts(np.random.default_rng([*seed, epoch]))[place], num_parts
-
     def _average(self, values: Float[np.ndarray, "seeds series"]) -> float:
         """The average over seeds, summed over series."""
         return float(np.asarray(averages(jnp.asarray(values), self.pooled), float).sum())
@@ -275,7 +268,10 @@ class _Ascent:
     def _advance(self, step: int, last: int, carry: PyTree) -> tuple[int, PyTree, PyTree]:
         """One step up."""
         reals, optimizer = carry
-        problem, factor = self._at_step(step)
+        factor = len(self._parts())  # batches in an epoch, of which each has an order of its own
+        epoch, place = divmod(step, factor)
+        seed = np.asarray(jax.random.key_data(self.key)).ravel()
+        problem = self._parts(np.random.default_rng([*seed, epoch]))[place]
         values, gradient = self._evaluate(jax.random.fold_in(self.key, step), problem, reals)
         idle = [name for name, leaf in gradient.items() if not np.asarray(leaf).any()]
         if step == 0 and idle:

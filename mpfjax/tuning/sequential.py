@@ -206,9 +206,8 @@ def smc2(
     prior = checked_prior(log_prior, problem, key_prior, sample_prior)
     require_same_prior(jax.random.fold_in(key_prior, 1), problem, prior, sample_prior)
     sampler = Sampler(problem, _pad(series, series.length), prior, int(num_moves))
-    settings = problem.settings | {
-        "key": key, "num_samples": int(num_samples), "num_moves": int(num_moves),
-    }  # fmt: skip
+    sizes = {"num_samples": int(num_samples), "num_moves": int(num_moves)}
+    settings = problem.settings | {"key": key} | sizes
     run = _Run(sampler, series, key_steps, checkpoint, progress, settings)
     samples = start(jax.random.split(key_filters, num_samples), sampler, reals)
     rows = np.empty(0), np.empty(0), np.empty(0)
