@@ -84,10 +84,11 @@ def two_at(gap):
     return make_mixture(np.array([[0.0, 0.0], [gap, 0.0]]), np.zeros(2), [0, 1], 2)
 
 
-def of_weights(log_weights):
-    return make_mixture(np.array([0.0, 10, 10, 0]), log_weights, [0, 0, 1, 1], 2)
+def of_weights(*weights):
+    return make_mixture(np.array([0.0, 10, 10, 0]), np.log(weights), [0, 0, 1, 1], 2)
 
 
+WITHIN_ONE = Merge(None, max_distance=1.0)
 BY_DISTANCE = Merge(None, max_distance=1.0, scale=(3.0, 1.0))
 MERGED = {
     "overlap": (Merge(1.0), clouds([[0, 0], [0.2, 0], [10, 0], [10, 8]], [40] * 4), [0, 0, 2, 3]),
@@ -101,16 +102,8 @@ MERGED = {
         clouds([[0.0], [3.0]], [50] * 2, scale=10.0),
         [0, 1],
     ),
-    "weighted": (
-        Merge(None, max_distance=1.0),
-        of_weights(np.log([0.999, 0.001, 0.001, 0.999])),
-        [0, 0],
-    ),
-    "weighted apart": (
-        Merge(None, max_distance=1.0),
-        of_weights(np.log([0.999, 0.001, 0.999, 0.001])),
-        [0, 1],
-    ),
+    "weighted": (WITHIN_ONE, of_weights(0.999, 0.001, 0.001, 0.999), [0, 0]),
+    "weighted apart": (WITHIN_ONE, of_weights(0.999, 0.001, 0.999, 0.001), [0, 1]),
 }
 
 
