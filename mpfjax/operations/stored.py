@@ -13,7 +13,7 @@ An operation has one form for CPUs and another for all other platforms.
 
 import inspect
 from collections.abc import Callable
-from functools import partial, wraps
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -87,30 +87,20 @@ def _stored_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return stored(*primals), tangents[0]
 
 
-def apart(function: Callable[..., PyTree], *operands: PyTree, **marks: str) -> PyTree:
+def apart(function: Callable[..., PyTree], *operands: PyTree) -> PyTree:
     """`function(*operands)`, which XLA on a CPU compiles apart from what is around it.
 
     What is the same, operation by operation, is then compiled once.
     """
     function = jax.jit(function)  # so that it is traced once for both forms
-    marks = {"inlineable": "false"} | marks
 
     def call(*operands: PyTree) -> PyTree:
         if _MARKS_VALUES:
-            return set_xla_metadata(function(*operands), **marks)
-        with set_xla_metadata(**marks):
+            return set_xla_metadata(function(*operands), inlineable="false")
+        with set_xla_metadata(inlineable="false"):
             return function(*operands)
 
     return on_platform(*operands, cpu=call, default=function)
-
-
-def in_one_kernel(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """The function of some numbers as one kernel on a CPU, where XLA has one for each operation.
-
-    Each kernel takes a hundredth of a second to compile, and part of a microsecond to start. XLA
-    compiles a short loop as one kernel; the call has the mark of such a loop.
-    """
-    return wraps(function)(partial(apart, function, xla_cpu_small_call="true"))
 
 
 def take(values: Array, indices: Int[Array, " n"]) -> Array:

@@ -14,7 +14,7 @@ from mpfjax.checks import Checked, check_shape, saying
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.logarithms import as_inexact
 from mpfjax.operations.segments import are_masked, column_sums, scaled_exp_of_segments, spread
-from mpfjax.operations.stored import in_one_kernel, stored
+from mpfjax.operations.stored import stored
 
 # Up to this many features are multiplied one by one, which runs on vectors.
 _FEW_FEATURES = 8
@@ -88,7 +88,7 @@ def origin(values: Rows, mixture: ParticleMixture) -> Float[Array, " k"]:
     return total / jnp.maximum(jnp.sum(filled), 1).astype(values.dtype)
 
 
-class Moments(eqx.Module):
+class Groups(eqx.Module):
     """The mass, mean and covariance of each group of particles, zero for an empty one."""
 
     masses: Float[Array, " g"]
@@ -115,17 +115,17 @@ def weighted_means(
 
 def summarise(
     features: Rows, weights: Float[Array, " n"], labels: Int[Array, " n"], num_groups: int
-) -> Moments:
+) -> Groups:
     """Weighted mass, mean and covariance of the particles under each label."""
     masses, means = weighted_means(features, weights, labels, num_groups)
     products, entries = _products(features - spread(means, labels), weights)
     covariances = column_sums(products, labels, num_groups) / _or_one(masses)[:, None]
-    return Moments(masses, means, covariances[:, entries])
+    return Groups(masses, means, covariances[:, entries])
 
 
 def summarise_about(
     points: Float[Array, "g k"], gaps: Rows, weights: Float[Array, " n"], labels: Int[Array, " n"]
-) -> Moments:
+) -> Groups:
     """`summarise` in one pass, of particles that are `gaps` away from a point of their group.
 
     If the point is many deviations away from the group's mean, the covariance loses digits to
@@ -134,16 +134,12 @@ def summarise_about(
     k = points.shape[1]
     products, entries = _products(gaps, weights)
     columns = jnp.concatenate([_first_moments(gaps, weights), products])
-
-    @in_one_kernel
-    def moments(points: Float[Array, "g k"], sums: Float[Array, "g c"]) -> Moments:
-        masses = sums[:, 0]
-        averages = sums[:, 1:] / _or_one(masses)[:, None]
-        offsets = averages[:, :k]
-        covariances = averages[:, k:][:, entries] - offsets[:, :, None] * offsets[:, None, :]
-        return Moments(masses, jnp.where((masses > 0)[:, None], points + offsets, 0.0), covariances)
-
-    return moments(points, column_sums(columns, labels, len(points)))
+    sums = column_sums(columns, labels, len(points))
+    masses = sums[:, 0]
+    averages = sums[:, 1:] / _or_one(masses)[:, None]
+    offsets = averages[:, :k]
+    covariances = averages[:, k:][:, entries] - offsets[:, :, None] * offsets[:, None, :]
+    return Groups(masses, jnp.where((masses > 0)[:, None], points + offsets, 0.0), covariances)
 
 
 def _or_one(masses: Float[Array, " g"]) -> Float[Array, " g"]:

@@ -15,15 +15,9 @@ from mpfjax.moves.base import (
     Regrouped,
     Step,
 )
-from mpfjax.moves.regrouping.features import (
-    ByFeatures,
-    Moments,
-    relative_weights,
-    separation,
-    summarise,
-)
+from mpfjax.moves.regrouping.features import ByFeatures, relative_weights, separation, summarise
 from mpfjax.operations.segments import spread
-from mpfjax.operations.stored import in_one_kernel, take
+from mpfjax.operations.stored import take
 
 
 class Merge(AbstractRegrouping, ByFeatures):
@@ -65,7 +59,16 @@ class Merge(AbstractRegrouping, ByFeatures):
         components, features = mixture.component_indicators, self.features_of(mixture)
         weights = relative_weights(mixture)
         groups = summarise(features, weights, components, mixture.num_components)
-        overlap, memory = in_one_kernel(self._overlap)(groups), mixture.memory
+        means, covariances = groups.means, groups.covariances
+        distance, deviations = separation(
+            means[:, None] - means[None], (covariances[:, None] + covariances[None]) / 2
+        )
+        alive = groups.masses > 0
+        overlap, memory = alive[:, None] & alive[None], mixture.memory
+        if self.max_deviations is not None:
+            overlap &= deviations < self.max_deviations
+        if self.max_distance is not None:
+            overlap &= distance < self.max_distance
         if self.patience == 1:
             labels = lowest_connected(overlap)
         else:
@@ -77,21 +80,7 @@ class Merge(AbstractRegrouping, ByFeatures):
             memory = memory | {"overlap_durations": durations}
         return spread(labels, components), memory
 
-    def _overlap(self, groups: Moments) -> Bool[Array, "m m"]:
-        """Which components overlap."""
-        means, covariances, alive = groups.means, groups.covariances, groups.masses > 0
-        distance, deviations = separation(
-            means[:, None] - means[None], (covariances[:, None] + covariances[None]) / 2
-        )
-        overlap = alive[:, None] & alive[None]
-        if self.max_deviations is not None:
-            overlap &= deviations < self.max_deviations
-        if self.max_distance is not None:
-            overlap &= distance < self.max_distance
-        return overlap
 
-
-@in_one_kernel
 def lowest_connected(adjacent: Bool[Array, "m m"]) -> Int[Array, " m"]:
     """The lowest label in the connected component of each node of a symmetric graph.
 

@@ -12,7 +12,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping, Regrouped
 from mpfjax.moves.regrouping.features import (
     ByFeatures,
-    Moments,
     Rows,
     relative_weights,
     separation,
@@ -22,7 +21,7 @@ from mpfjax.moves.regrouping.features import (
 from mpfjax.operations.logarithms import without_gradient
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.segments import segment_argmax, spread
-from mpfjax.operations.stored import VECTOR, cond_if_any, in_one_kernel, stored, take
+from mpfjax.operations.stored import VECTOR, cond_if_any, stored, take
 
 # 2-means starts at the two ends, and needs few iterations.
 _ITERATIONS = 3
@@ -92,12 +91,6 @@ class Split(AbstractRegrouping, ByFeatures):
         centres = _two_means(sample, m)
         side, gaps = _nearer(features, centres, parent)
         halves = summarise_about(centres, gaps, weights, parent + m * side)
-        return side, *in_one_kernel(self._compare)(halves)
-
-    def _compare(
-        self, halves: Moments
-    ) -> tuple[Int[Array, " m"], Float[Array, " m"], Bool[Array, " m"]]:
-        m = len(halves.masses) // 2
         masses = halves.masses.reshape(2, m)
         least_mass, total = jnp.min(masses, axis=0), jnp.sum(masses, axis=0)
         pooled = (halves.covariances[:m] + halves.covariances[m:]) / 2
@@ -108,7 +101,8 @@ class Split(AbstractRegrouping, ByFeatures):
             & (deviations > self.min_deviations)
             & (distance > self.min_distance)
         )
-        return jnp.where(masses[1] <= masses[0], 1, 0), deviations, splits
+        lighter = jnp.where(masses[1] <= masses[0], 1, 0)
+        return side, lighter, deviations, splits
 
 
 class _Particles(NamedTuple):
@@ -151,7 +145,6 @@ def _two_means(sample: _Particles, m: int) -> Float[Array, "g k"]:
     return jax.lax.fori_loop(0, _ITERATIONS, iterate, centres)
 
 
-@in_one_kernel
 def free_labels(
     is_candidate: Bool[Array, " m"], priority: Float[Array, " m"], active: Bool[Array, " m"]
 ) -> Int[Array, " m"]:

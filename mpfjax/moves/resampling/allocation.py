@@ -9,7 +9,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.logarithms import scaled_exp
 from mpfjax.operations.prefix_sums import count_starts
 from mpfjax.operations.segments import spread
-from mpfjax.operations.stored import in_one_kernel
+from mpfjax.operations.stored import stored
 
 # Bounds of the share of the slots that is shared equally: the variance of Ẑ is then at most
 # 4/3 of the least one at the first, and twice the least one at the second.
@@ -44,10 +44,13 @@ def allocate_slots(
         return jnp.where(due, share, counts)
     if counts.shape[0] == 1:
         return jnp.where(due, num_slots, counts)
-    return _in_proportion(counts, due, num_slots, demands)
+    pool = num_slots - jnp.sum(counts, dtype=jnp.int32)
+    sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
+    first = jnp.minimum(pool // sharers, 1)
+    share = first + _in_proportion(pool - first * sharers, due, demands)
+    return stored(jnp.where(due, share, counts))
 
 
-@in_one_kernel
 def demands_by_variance(
     log_masses: Float[Array, " m"],
     sample_sizes: Float[Array, " m"],
@@ -95,18 +98,10 @@ def demands_of_groups(
     return 1 / jnp.maximum(rivals, 1).astype(mixture.log_weights.dtype)
 
 
-@in_one_kernel
 def _in_proportion(
-    counts: Int[Array, " m"],
-    due: Bool[Array, " m"],
-    num_slots: int | Int[Array, ""],
-    demands: Float[Array, " m"],
+    pool: Int[Array, ""], due: Bool[Array, " m"], demands: Float[Array, " m"]
 ) -> Int[Array, " m"]:
-    """Integers that sum to the number of slots, those of the due components each one or more."""
-    sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
-    pool = num_slots - jnp.sum(counts, dtype=jnp.int32)
-    first = jnp.minimum(pool // sharers, 1)
-    pool -= first * sharers
+    """Integers that sum to `pool`, each within one of its exact part."""
     shares = jnp.where(due, demands, 0)
     total = jnp.sum(shares)
     shares = jnp.where(total > 0, shares, due.astype(shares.dtype))
@@ -115,7 +110,7 @@ def _in_proportion(
     # Despite rounding all slots are given, and none to a component that is not due.
     still_due = jnp.cumsum(due[::-1], dtype=jnp.int32)[::-1] - due.astype(jnp.int32)
     ends = jnp.where(still_due > 0, jnp.minimum(ends, pool), pool)
-    return jnp.where(due, first + jnp.diff(ends, prepend=0), counts)
+    return jnp.diff(ends, prepend=0)
 
 
 def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
